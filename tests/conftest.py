@@ -1,0 +1,18 @@
+"""Settings that must stand before any test module imports JAX, and Hypothesis's profile."""
+
+import os
+import sys
+from pathlib import Path
+
+# The CPU gives the same numbers everywhere, at full precision; a machine with an accelerator sets JAX_PLATFORMS itself.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+
+from hypothesis import settings
+
+# Tests share `helpers.py`; with import mode importlib their folder is not on the path by itself.
+sys.path.insert(0, str(Path(__file__).parent))
+
+# The first example of a test compiles, so no single example has a deadline. CI tries the same examples each time.
+settings.register_profile("swarmnet", deadline=None, derandomize=os.environ.get("CI") == "true")
+settings.load_profile("swarmnet")
