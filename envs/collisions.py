@@ -1,0 +1,112 @@
+"""Judging a batch of rollouts by its contacts: counted by physics, summarised here, each figure with an interval."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from envs.trajectories import AGENT, GOAL, Trajectories
+
+NEAR_GOAL = 15.0
+"""Contacts closer to the goal than this [m] are reported apart from those en route."""
+RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure with its 95% bootstrap interval over scenes; extremes (deepest, closest) have none."""
+
+    value: float
+    low: float | None
+    high: float | None
+    unit: str
+
+    def __str__(self) -> str:
+        scale, unit = (100, "%") if self.unit == "share" else (1, self.unit)
+        if self.low is None or self.high is None:
+            return f"{self.value * scale:.3g} {unit}".strip()
+        return f"{self.value * scale:.3g} [{self.low * scale:.3g}, {self.high * scale:.3g}] {unit}".strip()
+
+
+def collision_report(trajectories: Trajectories, *, reach: float = NEAR_GOAL, seed: int = 0) -> dict[str, Estimate]:
+    """Figures over all scenes, by name.
+
+    A contact step is a control step in which something touches at any of its substep states. Shares of steps are per
+    scene ("any agent of the scene touches") unless the name says `agent_`. An event is an onset of contact of an agent;
+    two agents that meet are two events. `ever_*` are shares of trajectories, and of agents, that touch at least once.
+    `minimum_clearance` is the smallest distance between surfaces at control steps [m], or minus the deepest penetration
+    at any substep. `time_to_goal` is the first time within `reach` of the goal [s], over agents that get there.
+    """
+    t = trajectories
+    agents = t.kind == AGENT
+    present = t.mask & agents[:, None]  # (S, T, V)
+    steps = present[:, 1:]
+    with_agent, with_solid = (t.agent_contact[:, 1:] > 0) & steps, (t.solid_contact[:, 1:] > 0) & steps
+    either = with_agent | with_solid
+    bootstrap = _Bootstrap(len(t), seed)
+    report: dict[str, Estimate] = {}
+
+    def share(name: str, hits: np.ndarray, among: np.ndarray) -> None:
+        axes = tuple(range(1, hits.ndim))
+        report[name] = bootstrap.ratio((hits & among).sum(axes), among.sum(axes), "share")
+
+    in_scene = steps.any(axis=2)
+    for name, touching in (("any", either), ("agent", with_agent), ("obstacle", with_solid)):
+        share(f"contact_steps_{name}", touching.any(axis=2), in_scene)
+    share("agent_contact_steps_any", either, steps)
+    for name, touching in (("any", either), ("agent", with_agent), ("obstacle", with_solid)):
+        share(f"ever_touching_trajectories_{name}", touching.any(axis=(1, 2)), in_scene.any(axis=1))
+    share("ever_touching_agents_any", either.any(axis=1), steps.any(axis=1))
+    for name, events in (("agent", t.agent_events), ("obstacle", t.solid_events)):
+        counts = (events[:, 1:] * steps).sum(axis=(1, 2))
+        report[f"events_per_trajectory_{name}"] = bootstrap.ratio(counts, np.ones(len(t)), "")
+    deepest = float((t.depth * present).max(initial=0))
+    report["deepest_penetration"] = Estimate(deepest, None, None, "m")
+    clearance = _clearance(t, present)
+    report["minimum_clearance"] = Estimate(-deepest if deepest > 0 else clearance, None, None, "m")
+    if (t.kind == GOAL).any():
+        goal = t.position[np.arange(len(t)), :, np.argmax(t.kind == GOAL, axis=1)]  # (S, T, 2)
+        distance = np.linalg.norm(t.position - goal[:, :, None], axis=-1)
+        there = present[:, -1]
+        report["final_goal_distance"] = bootstrap.ratio((distance[:, -1] * there).sum(1), there.sum(1), "m")
+        arrived = (distance <= reach) & present
+        share("reached_goal", arrived.any(axis=1), present.any(axis=1))
+        first = np.argmax(arrived, axis=1) * t.dt * arrived.any(axis=1)
+        report["time_to_goal"] = bootstrap.ratio(first.sum(1), arrived.any(axis=1).sum(1), "s")
+        near = distance[:, 1:] <= reach
+        share("agent_contact_steps_en_route", either, steps & ~near)
+        share("agent_contact_steps_near_goal", either, steps & near)
+    return report
+
+
+def _clearance(t: Trajectories, present: np.ndarray) -> float:
+    """Smallest surface distance [m] at control steps between an agent and another agent or an obstacle."""
+    bodies = t.mask & (t.kind != GOAL)[:, None]
+    smallest = np.inf
+    for node in range(t.position.shape[2]):
+        if not (t.kind[:, node] == AGENT).any():
+            continue
+        apart = np.linalg.norm(t.position - t.position[:, :, node : node + 1], axis=-1)
+        apart -= (t.radius + t.radius[:, node : node + 1])[:, None]
+        other = bodies & present[:, :, node : node + 1]
+        other[:, :, node] = False
+        smallest = min(smallest, float(np.min(apart, where=other, initial=np.inf)))
+    return smallest
+
+
+class _Bootstrap:
+    """Percentile bootstrap over scenes, the same resamples for every figure."""
+
+    def __init__(self, scenes: int, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.weights: Float[np.ndarray, "B S"] = rng.multinomial(scenes, np.full(scenes, 1 / scenes), size=RESAMPLES)
+
+    def ratio(self, top: np.ndarray, bottom: np.ndarray, unit: str) -> Estimate:
+        """Sum of `top` over sum of `bottom`, both per scene; NaN when there is nothing to divide by."""
+        top, bottom = np.asarray(top, float), np.asarray(bottom, float)
+        if not bottom.sum():
+            return Estimate(float("nan"), None, None, unit)
+        below = self.weights @ bottom
+        samples = (self.weights @ top)[below > 0] / below[below > 0]
+        low, high = np.quantile(samples, [0.025, 0.975])
+        return Estimate(float(top.sum() / bottom.sum()), float(low), float(high), unit)

@@ -1,0 +1,31 @@
+"""Physics engines behind one protocol. Names: `native` (C, threads), `mjx` (XLA)."""
+
+from typing import TYPE_CHECKING
+
+from swarm_mjcf.errors import SpecError
+from swarm_mjcf.spec import SceneSpec
+
+if TYPE_CHECKING:
+    from envs.engines.engine import Engine
+
+ENGINES = ("native", "mjx")
+
+
+def make_engine(spec: SceneSpec, name: str = "auto", *, threads: int = 0) -> "Engine":
+    """An engine by name; `auto` takes `mjx` where JAX has a GPU or TPU and `native` elsewhere.
+
+    `threads` is for the native engine; 0 takes every CPU. Raises SpecError for a name that does not exist.
+    """
+    if name == "auto":
+        import jax
+
+        name = "native" if jax.default_backend() == "cpu" else "mjx"
+    if name == "native":
+        from envs.engines.native import NativeEngine
+
+        return NativeEngine(spec, threads=threads)
+    if name == "mjx":
+        from envs.engines.mjx import MjxEngine
+
+        return MjxEngine(spec)
+    raise SpecError("engine", name, "one of auto, " + ", ".join(ENGINES))

@@ -1,0 +1,234 @@
+"""Trajectories in HDF5: compressed, checksummed slab by slab, written whole or not at all, read whole or streamed."""
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from envs.trajectories import ARRAYS, Trajectories, TrajectoryError, concatenate
+
+FORMAT = "swarmnet-trajectories"
+VERSION = 1
+SLAB = 256
+"""Scenes per HDF5 chunk and per checksum: what a streaming reader holds at least."""
+_SCALARS = ("dt", "substeps", "max_speed", "max_acceleration")
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file holds, without reading its arrays."""
+
+    path: Path
+    scenes: int
+    rows: int
+    nodes: int
+    dt: float
+    substeps: int
+    max_speed: float
+    max_acceleration: float
+    provenance: dict
+
+
+class TrajectoryWriter:
+    """Writes trajectories part by part; the file appears under its name only when `close` has finished it.
+
+    Use as a context manager: an exception inside leaves no file and whatever was there before untouched.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}.partial")
+        with _explained(self.path, "write"):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = h5py.File(self._partial, "w", track_order=True)
+        self._pending: Trajectories | None = None
+        self._digests: list[str] = []
+
+    def __enter__(self) -> "TrajectoryWriter":
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._discard()
+
+    def append(self, part: Trajectories) -> None:
+        """Adds scenes. All parts have the same rows, nodes, dt and limits, and their first's provenance."""
+        with self._failing_cleanly():
+            pending = part if self._pending is None else concatenate([self._pending, part])
+            whole = len(pending) // SLAB * SLAB
+            for start in range(0, whole, SLAB):
+                self._write(pending.take(slice(start, start + SLAB)))
+            self._pending = pending.take(slice(whole, None))
+
+    def close(self) -> None:
+        """Writes what is left and the checksums, flushes to disk, and gives the file its name."""
+        with self._failing_cleanly():
+            if self._pending is None:
+                raise TrajectoryError(f"{self.path}: no scenes to write")
+            if len(self._pending):
+                self._write(self._pending)
+            attrs = self._file.attrs
+            attrs["format"], attrs["version"], attrs["slab"] = FORMAT, VERSION, SLAB
+            for name in _SCALARS:
+                attrs[name] = getattr(self._pending, name)
+            attrs["provenance"] = json.dumps(self._pending.provenance)
+            attrs["digests"] = json.dumps(self._digests)
+            attrs["seal"] = _seal(self._file)
+            self._file.close()
+            with open(self._partial, "rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(self._partial, self.path)
+
+    def _write(self, slab: Trajectories) -> None:
+        for name in ARRAYS:
+            array = getattr(slab, name)
+            if name not in self._file:
+                self._file.create_dataset(
+                    name,
+                    shape=(0, *array.shape[1:]),
+                    maxshape=(None, *array.shape[1:]),
+                    chunks=(SLAB, *array.shape[1:]),
+                    dtype=array.dtype,
+                    compression="gzip",
+                    compression_opts=1,
+                    shuffle=True,
+                    fletcher32=True,
+                )
+            data = _array(self._file, name)
+            if data.shape[1:] != array.shape[1:]:
+                raise TrajectoryError(f"{self.path}: {name} is {array.shape[1:]}, earlier scenes have {data.shape[1:]}")
+            data.resize(data.shape[0] + len(array), axis=0)
+            data[-len(array) :] = array
+        self._digests.append(_digest(slab))
+
+    @contextlib.contextmanager
+    def _failing_cleanly(self) -> Iterator[None]:
+        try:
+            with _explained(self.path, "write"):
+                yield
+        except BaseException:
+            self._discard()
+            raise
+
+    def _discard(self) -> None:
+        with contextlib.suppress(Exception):  # closing flushes, and a full disk fails again
+            self._file.close()
+        self._partial.unlink(missing_ok=True)
+
+
+def save(path: str | Path, trajectories: Trajectories) -> None:
+    """Writes a file whole or not at all."""
+    with TrajectoryWriter(path) as writer:
+        writer.append(trajectories)
+
+
+def read_header(path: str | Path) -> Header:
+    """What a file holds. Raises TrajectoryError for a missing, foreign, truncated or altered file."""
+    with _opened(path) as file:
+        scenes, rows, nodes = _array(file, "mask").shape
+        attrs = file.attrs
+        return Header(
+            path=Path(path),
+            scenes=scenes,
+            rows=rows,
+            nodes=nodes,
+            provenance=json.loads(str(attrs["provenance"])),
+            **_scalars(attrs),
+        )
+
+
+def stream(path: str | Path) -> Iterator[Trajectories]:
+    """Slabs of at most `SLAB` scenes, each checked against its checksum."""
+    header = read_header(path)
+    with _opened(path) as file:
+        digests = json.loads(str(file.attrs["digests"]))
+        for number, start in enumerate(range(0, header.scenes, SLAB)):
+            slab = Trajectories(
+                **{name: _array(file, name)[start : start + SLAB] for name in ARRAYS},
+                **{name: getattr(header, name) for name in _SCALARS},
+                provenance=header.provenance,
+            )
+            if _digest(slab) != digests[number]:
+                raise TrajectoryError(f"{path}: scenes {start} to {start + len(slab) - 1} do not match their checksum")
+            yield slab
+
+
+def load(path: str | Path, *, scenes: int | None = None) -> Trajectories:
+    """A file's trajectories (the first `scenes` of them), checked. Raises TrajectoryError."""
+    parts, have = [], 0
+    for slab in stream(path):
+        parts.append(slab)
+        have += len(slab)
+        if scenes is not None and have >= scenes:
+            break
+    if scenes is not None and have < scenes:
+        raise TrajectoryError(f"{path}: {scenes} scenes were asked for, it holds {have}")
+    whole = concatenate(parts)
+    return whole if scenes is None else whole.take(slice(0, scenes))
+
+
+def _array(file: h5py.File, name: str) -> h5py.Dataset:
+    data = file[name]
+    if not isinstance(data, h5py.Dataset):
+        raise TypeError(f"{name} is no array")
+    return data
+
+
+def _scalars(attrs: Any) -> dict[str, Any]:
+    return {name: attrs[name].item() for name in _SCALARS}
+
+
+def _digest(slab: Trajectories) -> str:
+    digest = hashlib.sha256()
+    for name in ARRAYS:
+        digest.update(np.ascontiguousarray(getattr(slab, name)).view(np.uint8).data)
+    return digest.hexdigest()
+
+
+def _seal(file: h5py.File) -> str:
+    """Checksum of everything that is not in a slab's checksum."""
+    attrs = {name: str(file.attrs[name]) for name in ("version", "slab", *_SCALARS, "provenance", "digests")}
+    arrays = {name: _array(file, name) for name in ARRAYS}
+    shapes = {name: [list(array.shape), str(array.dtype)] for name, array in arrays.items()}
+    return hashlib.sha256(json.dumps([attrs, shapes], sort_keys=True).encode()).hexdigest()
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path) -> Iterator[h5py.File]:
+    with _explained(path, "read"), h5py.File(path, "r") as file:
+        if file.attrs.get("format") != FORMAT:
+            raise TrajectoryError(f"{path}: an HDF5 file, but not of trajectories (no '{FORMAT}' header)")
+        if file.attrs["version"] != VERSION:
+            raise TrajectoryError(
+                f"{path}: version {file.attrs['version']} of the format, this program reads {VERSION}"
+            )
+        if file.attrs.get("seal") != _seal(file):
+            raise TrajectoryError(f"{path}: corrupt, its header does not match its checksum")
+        yield file
+
+
+@contextlib.contextmanager
+def _explained(path: str | Path, verb: str) -> Iterator[None]:
+    """Turns what HDF5, the file system and a corrupt header can throw into one TrajectoryError."""
+    try:
+        yield
+    except TrajectoryError as error:
+        if str(path) not in str(error):
+            raise TrajectoryError(f"{path}: {error}") from error
+        raise
+    except FileNotFoundError as error:
+        raise TrajectoryError(f"{path}: does not exist") from error
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if verb == "read":
+            raise TrajectoryError(f"{path}: not a whole HDF5 file of trajectories ({reason})") from error
+        raise TrajectoryError(f"{path}: cannot be written ({reason})") from error

@@ -1,0 +1,108 @@
+"""The environment: `reset(keys)`, `step(state, acceleration)`. Holds constants only; all that changes is in `State`."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, Key
+
+from envs.config import SpawnConfig
+from envs.dynamics import limited
+from envs.engines import make_engine
+from envs.engines.engine import Engine
+from envs.record import Array, record
+from envs.spawn import check_spawn, spawn, too_dense
+from envs.state import Contacts, State
+from swarm_mjcf.errors import SpecError
+from swarm_mjcf.spec import SceneSpec
+
+
+@record
+class Transition:
+    """What one control step brought."""
+
+    state: State
+    contacts: Contacts
+    terminated: Bool[Array, " S"]
+    """The scene ended by what happened in it: a contact, when `terminate_on_contact` is set."""
+    truncated: Bool[Array, " S"]
+    """The scene ended because `horizon` steps are over."""
+
+
+def scene_keys(seed: int, scenes: Int[Array, " S"] | range) -> Key[Array, " S"]:
+    """One key per scene from a seed and global scene numbers: scene 7 of seed 0 is the same in every batch."""
+    return jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.asarray(np.asarray(scenes), jnp.uint32))
+
+
+class SwarmEnv:
+    """S scenes at once. `step` is callable inside `jit` and `lax.scan`; so is `spawn`; `reset` checks and may raise.
+
+    Args:
+      spec: the scene. engine: a name (`auto`, `native`, `mjx`) or an engine made for the same spec.
+      spawn: where scenes start. horizon: control steps per episode. terminate_on_contact: end a scene at any contact.
+    """
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        *,
+        engine: str | Engine = "auto",
+        spawn: SpawnConfig | None = None,
+        horizon: int = 50,
+        terminate_on_contact: bool = False,
+    ) -> None:
+        if horizon < 1:
+            raise SpecError("horizon", horizon, "at least 1 control step")
+        self.spec = spec
+        self.spawn_config = SpawnConfig() if spawn is None else spawn
+        check_spawn(spec, self.spawn_config)
+        self.engine = make_engine(spec, engine) if isinstance(engine, str) else engine
+        if self.engine.spec != spec:
+            raise SpecError("engine", self.engine.spec, "an engine made for the environment's spec")
+        self.horizon = horizon
+        self.terminate_on_contact = terminate_on_contact
+        self._spawn = jax.jit(self.spawn)
+
+    def spawn(self, keys: Key[Array, " S"]) -> tuple[State, Bool[Array, " S"]]:
+        """Starting states and whether each scene found room for its bodies."""
+        return spawn(keys, self.spec, self.spawn_config)
+
+    def reset(self, keys: Key[Array, " S"]) -> State:
+        """Starting states. Raises SpawnError when a scene has no room; inside `jit` use `spawn`."""
+        state, ok = self._spawn(keys)
+        failed = int(np.sum(~np.asarray(ok)))
+        if failed:
+            raise too_dense(self.spec, self.spawn_config, failed, len(ok))
+        return state
+
+    def step(self, state: State, acceleration: Float[Array, "S N 2"]) -> Transition:
+        """One control step. `acceleration` [m/s^2] is clipped to the limits, and absent agents do nothing.
+
+        A scene with a non-finite state or acceleration never reaches the engine: its bodies become NaN and stay so.
+        """
+        finite = jnp.isfinite(acceleration).all((1, 2)) & jnp.isfinite(state.position).all((1, 2))
+        finite &= jnp.isfinite(state.velocity).all((1, 2))
+
+        def safe(x: Array) -> Array:
+            return jnp.where(finite[:, None, None], x, 0)
+
+        wanted = jnp.where(state.agent_present[..., None], safe(acceleration), 0)
+        sound = replace(state, position=safe(state.position), velocity=safe(state.velocity))
+        executed = limited(sound.velocity, wanted, self.spec)
+        after, contacts = self.engine.step(sound, executed)
+        contacts = jax.tree.map(lambda x: jnp.where(finite[:, None], x, 0), contacts)
+
+        def sick(x: Array) -> Array:
+            return jnp.where(finite[:, None, None], x, jnp.nan).astype(x.dtype)
+
+        step = state.step + 1
+        after = replace(after, position=sick(after.position), velocity=sick(after.velocity), step=step)
+        touched = (contacts.agent_states + contacts.obstacle_states + contacts.wall_states).any(axis=1)
+        return Transition(
+            state=after,
+            contacts=contacts,
+            terminated=touched & self.terminate_on_contact,
+            truncated=step >= self.horizon,
+        )
