@@ -1,0 +1,115 @@
+"""Checkpoints through orbax: the full state of training, atomic, and what a model needs to be used without it."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from envs.plain import from_plain, plain
+from gnn.config import ModelConfig
+from gnn.decode import Integrator, Params
+from gnn.features import Scales
+from swarm_mjcf.errors import SwarmError
+
+logging.getLogger("absl").setLevel(logging.ERROR)  # orbax reports every save in a dozen lines
+
+
+class CheckpointError(SwarmError):
+    """A checkpoint is missing, unreadable, of other settings, or cannot be written."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model: weights and all that decoding needs."""
+
+    config: ModelConfig
+    scales: Scales
+    integrator: Integrator
+    params: Params
+    about: dict
+    """Plain JSON: preset, step, training settings and data it was made with."""
+
+
+class Checkpoints:
+    """The checkpoints of one run in `folder`, newest two kept. A save is complete or absent; leftovers are removed."""
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder).absolute()
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=2, cleanup_tmp_directories=True, enable_async_checkpointing=False
+        )
+        with _explained(self.folder, "opened"):
+            self._manager = ocp.CheckpointManager(self.folder, options=options)
+
+    def latest(self) -> int | None:
+        """Step of the newest whole checkpoint."""
+        return self._manager.latest_step()
+
+    def save(self, step: int, state: dict, about: dict) -> None:
+        """Writes the full state and the description."""
+        with _explained(self.folder, "written"):
+            self._manager.save(
+                step,
+                args=ocp.args.Composite(state=ocp.args.StandardSave(state), about=ocp.args.JsonSave(about)),
+                force=True,
+            )
+            self._manager.wait_until_finished()
+
+    def about(self, step: int) -> dict:
+        """The description saved with a checkpoint."""
+        with _explained(self.folder, "read"):
+            return self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
+
+    def restore(self, step: int, like: dict) -> dict:
+        """The state of a checkpoint, in the structure and dtypes of `like`."""
+        with _explained(self.folder, "read"):
+            template = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+            args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
+            return self._manager.restore(step, args=args)["state"]
+
+    def close(self) -> None:
+        """Releases the folder."""
+        self._manager.close()
+
+
+def describe(config: ModelConfig, scales: Scales, integrator: Integrator) -> dict:
+    """What `load_model` needs besides the weights, as plain JSON (floats survive exactly)."""
+    return {
+        "model": plain(config),
+        "scales": {name: np.asarray(value, np.float64).tolist() for name, value in vars(scales).items()},
+        "integrator": plain(integrator),
+    }
+
+
+def load_model(folder: str | Path) -> Model:
+    """The newest model in a checkpoint folder (`runs/NAME/checkpoints`). Raises CheckpointError."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise CheckpointError(f"{folder}: no such checkpoint folder; `swarmnet train` makes one")
+    checkpoints = Checkpoints(folder)
+    step = checkpoints.latest()
+    if step is None:
+        raise CheckpointError(f"{folder}: holds no whole checkpoint")
+    about = checkpoints.about(step)
+    with _explained(folder, "read"):
+        state = checkpoints._manager.restore(step, args=ocp.args.Composite(state=ocp.args.StandardRestore()))["state"]
+        config = from_plain(ModelConfig, about["model"])
+        scales = Scales(**{name: jnp.asarray(value, jnp.float32) for name, value in about["scales"].items()})
+        integrator = from_plain(Integrator, about["integrator"])
+    checkpoints.close()
+    return Model(config, scales, integrator, state["params"], about | {"step": step})
+
+
+@contextmanager
+def _explained(folder: Path, what: str) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{folder}: checkpoint cannot be {what} ({reason})") from error

@@ -1,0 +1,93 @@
+"""From a network's output to the next state, and from that to a horizon: the integrator is the physics engine's own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from envs.dynamics import free_flight, limited
+from envs.experts.boids import Policy
+from envs.record import Array
+from envs.state import State
+from gnn.config import ModelConfig
+from gnn.features import Scales
+from gnn.graph import Graph, graph_of_state
+from gnn.swarmnet import SwarmNet
+from swarm_mjcf.errors import SwarmError
+
+Params = dict
+"""Nested dict of weights, see `gnn.swarmnet`."""
+Predict = Callable[..., Array]
+
+
+@dataclass(frozen=True)
+class Integrator:
+    """The control step a model was trained for; a checkpoint stores it."""
+
+    dt: float
+    """[s]"""
+    substeps: int
+    """Physics steps per control step."""
+    max_speed: float
+    """[m/s]"""
+    max_acceleration: float
+    """[m/s^2]"""
+
+
+def network(config: ModelConfig, scales: Scales) -> Callable[[Params, Array, Graph], Array]:
+    """`(params, history (B, W, V, 4), graph) -> (B, n, out)`, the network's raw output."""
+    model = SwarmNet(config, scales)
+
+    def apply(params: Params, history: Array, graph: Graph) -> Array:
+        return jnp.asarray(model.apply({"params": params}, history, graph))
+
+    return apply
+
+
+def make_predict(config: ModelConfig, scales: Scales, integrator: Integrator) -> Predict:
+    """`predict(params, history (B, W, V, 4), graph, horizon=h) -> (B, h, V, 4)`, each state fed back as input."""
+    apply = network(config, scales)
+
+    def advance(params: Params, history: Float[Array, "B W V 4"], graph: Graph) -> Float[Array, "B V 4"]:
+        out = apply(params, history, graph)
+        last = history[:, -1]
+        if config.output == "state_change":
+            return last + out
+        first = last.shape[1] - out.shape[1]
+        position, velocity = last[:, first:, :2], last[:, first:, 2:]
+        if config.clip:
+            out = limited(velocity, out, integrator)
+        here = graph.present[:, first:, None]
+        after = jnp.concatenate(free_flight(position, velocity, jnp.where(here, out, 0), integrator), axis=-1)
+        return jnp.concatenate([last[:, :first], jnp.where(here, after, last[:, first:])], axis=1)
+
+    def predict(params: Params, history: Array, graph: Graph, *, horizon: int) -> Float[Array, "B h V 4"]:
+        def step(history: Array, _: None):
+            after = advance(params, history, graph)
+            return jnp.concatenate([history[:, 1:], after[:, None]], axis=1), after
+
+        _, states = jax.lax.scan(step, history, None, length=horizon)
+        return jnp.swapaxes(states, 0, 1)
+
+    return predict
+
+
+def make_policy(config: ModelConfig, scales: Scales, *, goal: bool = True) -> Policy:
+    """The network as a policy `(state, params, key) -> acceleration (S, N, 2) [m/s^2]` for the environment.
+
+    Raises SwarmError for a model that sees a history or predicts state changes: it has no acceleration to execute.
+    """
+    if config.window != 1 or config.output != "acceleration":
+        raise SwarmError(
+            "a model with a history window or a state-change output (preset thesis-ch3) predicts, it does not act: "
+            "physics needs an acceleration from the present state; use preset thesis-ch5 or best"
+        )
+    apply = network(config, scales)
+
+    def policy(state: State, params: Params, key: object = None) -> Float[Array, "S N 2"]:
+        nodes, graph = graph_of_state(state, goal=goal)
+        return apply(params, nodes[:, None], graph)
+
+    return policy

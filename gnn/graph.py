@@ -1,0 +1,64 @@
+"""The graph of a swarm: node states in the order goals, obstacles, agents, and typed, masked edges into the agents."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from envs.record import Array, record
+from envs.state import State
+from envs.trajectories import AGENT_EDGE, GOAL_EDGE, OBSTACLE_EDGE
+
+EDGE_TYPES = {"goal": GOAL_EDGE, "obstacle": OBSTACLE_EDGE, "agent": AGENT_EDGE}
+"""Edge functions by name, with the type in `Trajectories.edges`; in the order of the sender nodes."""
+
+
+@record
+class Graph:
+    """Who sends to whom, by type. Receivers are the agents; ghosts (padding) neither send nor receive."""
+
+    present: Bool[Array, "B V"]
+    goal: Bool[Array, "B N G"]
+    """Edges goal -> agent, (receiver, sender)."""
+    obstacle: Bool[Array, "B N K"]
+    agent: Bool[Array, "B N N"]
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Numbers of goals, obstacles and agents."""
+        return self.goal.shape[-1], self.obstacle.shape[-1], self.agent.shape[-1]
+
+
+def graph_of_edges(edges: Int[Array, "B V V"], present: Bool[Array, "B V"], counts: tuple[int, int, int]) -> Graph:
+    """The graph of `Trajectories.edges` (source, target), without the edges of absent nodes."""
+    goals, obstacles, _ = counts
+    first = goals + obstacles
+    alive = jnp.asarray(edges) * (present[:, :, None] & present[:, None])
+    into_agents = jnp.swapaxes(alive[:, :, first:], 1, 2)  # (B, N, V)
+    return Graph(
+        present=present,
+        goal=into_agents[:, :, :goals] == GOAL_EDGE,
+        obstacle=into_agents[:, :, goals:first] == OBSTACLE_EDGE,
+        agent=into_agents[:, :, first:] == AGENT_EDGE,
+    )
+
+
+def graph_of_state(state: State, *, goal: bool) -> tuple[Float[Array, "S V 4"], Graph]:
+    """Node states and graph of an environment's state: every agent receives from everything present but itself."""
+    scenes, agents, _ = state.position.shape
+    here = state.agent_present
+    goals = jnp.ones((scenes, int(goal)), bool)
+    still = jnp.where(state.obstacle_present[..., None], state.obstacle, 0)
+    if goal:
+        still = jnp.concatenate([state.goal[:, None], still], axis=1)
+    moving = jnp.concatenate([state.position, state.velocity], axis=-1)
+    nodes = jnp.concatenate(
+        [jnp.concatenate([still, jnp.zeros_like(still)], axis=-1), jnp.where(here[..., None], moving, 0)], axis=1
+    )
+    others = ~np.eye(agents, dtype=bool)
+    graph = Graph(
+        present=jnp.concatenate([goals, state.obstacle_present, here], axis=1),
+        goal=here[:, :, None] & goals[:, None],
+        obstacle=here[:, :, None] & state.obstacle_present[:, None],
+        agent=here[:, :, None] & here[:, None] & others,
+    )
+    return nodes, graph
