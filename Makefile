@@ -1,7 +1,7 @@
 # `make` alone lists the targets. Everything runs in .venv, which `setup` creates and completes; nothing else is needed.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test check bench lock clean
+.PHONY: help setup demo test check bench docs lock clean
 
 ARGS ?=
 BIN := .venv/bin
@@ -29,6 +29,9 @@ check: setup  ## Format, lint, check types and imports (with CI=true: only check
 
 bench: setup  ## Run the benchmarks: ARGS go to `swarmnet bench`
 	@$(BIN)/swarmnet bench $(ARGS)
+
+docs: setup  ## Render docs/results.md from docs/results/*.json
+	@$(BIN)/python -m swarmnet.results
 
 lock:  ## Write requirements.lock anew (ARGS=--upgrade for newer versions)
 	@sh tools/lock.sh $(ARGS)

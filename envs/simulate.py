@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 
 from envs.config import SimulateConfig
+from envs.engines import make_engine
 from envs.experts.boids import boids
 from envs.plain import plain
 from envs.rollout import make_rollout
@@ -30,7 +31,8 @@ Progress = Callable[[int, int], None]
 def simulate_chunks(config: SimulateConfig, skip: frozenset[int] = frozenset()):
     """Yields (chunk number, Trajectories) for all chunks not in `skip`. One compile: a short last chunk is padded."""
     world = config.world()
-    env = SwarmEnv(world.scene, engine=config.engine, spawn=world.spawn, horizon=config.steps)
+    engine = make_engine(world.scene, config.engine, threads=config.threads)
+    env = SwarmEnv(world.scene, engine=engine, spawn=world.spawn, horizon=config.steps)
     run = make_rollout(env, boids(world.boids), steps=config.steps)
     size = min(config.chunk, config.scenes)
     about = provenance(config, env.engine.name)
@@ -58,13 +60,15 @@ def simulate(config: SimulateConfig, path: str | Path, *, progress: Progress | N
             )
         return header
     parts = path.with_name(path.name + ".parts")
-    have = {number: part for number in range(-(-config.scenes // min(config.chunk, config.scenes)))
-            if (part := parts / f"{fingerprint(config)}-{number:06d}.h5").exists() and _sound(part)}  # fmt: skip
+    size = min(config.chunk, config.scenes)
+    # Chunks of another size hold other scenes under the same number.
+    names = [f"{fingerprint(config)}-{size}-{number:06d}.h5" for number in range(-(-config.scenes // size))]
+    have = {number: parts / name for number, name in enumerate(names) if _sound(parts / name)}
     done = sum(read_header(part).scenes for part in have.values())
     if progress:
         progress(done, config.scenes)
     for number, chunk in simulate_chunks(config, frozenset(have)):
-        have[number] = parts / f"{fingerprint(config)}-{number:06d}.h5"
+        have[number] = parts / names[number]
         save(have[number], chunk)
         done += len(chunk)
         if progress:
@@ -104,7 +108,7 @@ def _sound(part: Path) -> bool:
     try:
         read_header(part)
     except TrajectoryError:
-        part.unlink()
+        part.unlink(missing_ok=True)
         return False
     return True
 

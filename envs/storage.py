@@ -36,6 +36,51 @@ class Header:
     provenance: dict
 
 
+class _Disk:
+    """The file that HDF5 writes to.
+
+    HDF5 cannot close a file after a write that failed: it crashes the process. So a full disk is noted here, HDF5 is
+    told that all is well, and the writer raises the error.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115
+        self.error: OSError | None = None
+        self.read, self.readinto, self.seek = self._file.read, self._file.readinto, self._file.seek
+        self.tell, self.close = self._file.tell, self._file.close
+
+    def write(self, data: Any) -> int:
+        rest = memoryview(data).cast("B")
+        whole = len(rest)
+        with self._noting():
+            while len(rest):
+                rest = rest[self._file.write(rest) :]
+        return whole
+
+    def truncate(self, size: int) -> None:
+        with self._noting():
+            self._file.truncate(size)
+
+    def flush(self) -> None:
+        """Nothing is buffered here."""
+
+    def sync(self) -> None:
+        with self._noting():
+            os.fsync(self._file.fileno())
+
+    def check(self) -> None:
+        """Raises what went wrong so far."""
+        if self.error is not None:
+            raise self.error
+
+    @contextlib.contextmanager
+    def _noting(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.error = self.error or error
+
+
 class TrajectoryWriter:
     """Writes trajectories part by part; the file appears under its name only when `close` has finished it.
 
@@ -47,7 +92,8 @@ class TrajectoryWriter:
         self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}.partial")
         with _explained(self.path, "write"):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = h5py.File(self._partial, "w", track_order=True)
+            self._disk = _Disk(self._partial)
+            self._file = h5py.File(self._disk, "w", track_order=True)
         self._pending: Trajectories | None = None
         self._digests: list[str] = []
 
@@ -63,6 +109,8 @@ class TrajectoryWriter:
     def append(self, part: Trajectories) -> None:
         """Adds scenes. All parts have the same rows, nodes, dt and limits, and their first's provenance."""
         with self._failing_cleanly():
+            if self._pending is not None:
+                self._check_like(part, self._pending)
             pending = part if self._pending is None else concatenate([self._pending, part])
             whole = len(pending) // SLAB * SLAB
             for start in range(0, whole, SLAB):
@@ -84,8 +132,9 @@ class TrajectoryWriter:
             attrs["digests"] = json.dumps(self._digests)
             attrs["seal"] = _seal(self._file)
             self._file.close()
-            with open(self._partial, "rb+") as file:
-                os.fsync(file.fileno())
+            self._disk.sync()
+            self._disk.check()
+            self._disk.close()
             os.replace(self._partial, self.path)
 
     def _write(self, slab: Trajectories) -> None:
@@ -104,11 +153,18 @@ class TrajectoryWriter:
                     fletcher32=True,
                 )
             data = _array(self._file, name)
-            if data.shape[1:] != array.shape[1:]:
-                raise TrajectoryError(f"{self.path}: {name} is {array.shape[1:]}, earlier scenes have {data.shape[1:]}")
             data.resize(data.shape[0] + len(array), axis=0)
             data[-len(array) :] = array
+            self._disk.check()
         self._digests.append(_digest(slab))
+
+    def _check_like(self, part: Trajectories, earlier: Trajectories) -> None:
+        for name in (*ARRAYS, *_SCALARS):
+            new, old = getattr(part, name), getattr(earlier, name)
+            if name in ARRAYS:
+                new, old = f"{new.dtype}{new.shape[1:]}", f"{old.dtype}{old.shape[1:]}"
+            if new != old:
+                raise TrajectoryError(f"{self.path}: {name} is {new}, earlier scenes have {old}")
 
     @contextlib.contextmanager
     def _failing_cleanly(self) -> Iterator[None]:
@@ -120,8 +176,10 @@ class TrajectoryWriter:
             raise
 
     def _discard(self) -> None:
-        with contextlib.suppress(Exception):  # closing flushes, and a full disk fails again
+        with contextlib.suppress(Exception):
             self._file.close()
+        with contextlib.suppress(Exception):
+            self._disk.close()
         self._partial.unlink(missing_ok=True)
 
 

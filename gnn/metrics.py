@@ -20,7 +20,7 @@ class Metrics:
         self._file = self.path.open("a")
         self._board = SummaryWriter(str(self.path.parent / "tensorboard"), purge_step=after_step + 1)
 
-    def write(self, step: int, **values: float) -> None:
+    def write(self, step: int, **values: float | int) -> None:
         """Adds a row and makes sure that a reader sees it."""
         self._file.write(json.dumps({"step": step, **values}) + "\n")
         self._file.flush()

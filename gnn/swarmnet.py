@@ -109,7 +109,7 @@ class SwarmNet(nn.Module):
         return jnp.concatenate(parts, axis=-1)
 
 
-def _aggregate(typed: list[tuple[Array, Bool[Array, "B N M"]]], how: str) -> Float[Array, "B N F"]:
+def _aggregate(typed: list[tuple[Array, Bool[Array, "B N _"]]], how: str) -> Float[Array, "B N F"]:
     """Messages joined over senders; `sum` over all types together (eq. 5.23), `mean` and `max` side by side by type."""
     if how == "sum":
         return sum(jnp.sum(jnp.where(mask[..., None], m, 0), axis=2) for m, mask in typed)  # pyright: ignore[reportReturnType]

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +22,11 @@ from swarm_mjcf.spec import SceneSpec
 _BROADPHASE_AGENTS = 32
 """Up to this many agents, all pairs in NumPy are faster than MuJoCo's visit to every scene."""
 
+_SLACK = 0.01
+"""Added to distances there [m]: far above what float32 rounds off in an arena."""
+_COUNTS = ("agent_states", "obstacle_states", "wall_states", "agent_events", "obstacle_events", "wall_events")
+_DEPTHS = ("agent_depth", "obstacle_depth", "wall_depth")
+
 
 @dataclass
 class _Worker:
@@ -28,10 +34,6 @@ class _Worker:
 
     batch: Batch
     records: dict = field(default_factory=dict)
-
-
-def _like(array: Array) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(array.shape, array.dtype)
 
 
 class NativeEngine:
@@ -54,28 +56,40 @@ class NativeEngine:
     def step(self, state: State, acceleration: Float[Array, "S N 2"]) -> tuple[State, Contacts]:
         """One control step of `substeps` physics steps; contacts of states 1..k."""
         scenes, agents, _ = state.position.shape
-        empty = no_contacts(scenes, agents)
-        bodies = {"position": _like(state.position), "velocity": _like(state.velocity)}
+        dtype = state.position.dtype
+        # Few, packed arrays cross the border: each costs as much as stepping a dozen scenes.
+        bodies = jnp.concatenate([state.position, state.velocity, acceleration.astype(dtype)], axis=-1)
+        moved = jax.ShapeDtypeStruct((scenes, agents, 4), dtype)
         if not self.spec.contacts:
-            position, velocity = jax.pure_callback(
-                self._advance, tuple(bodies.values()), state, acceleration, vmap_method="sequential"
-            )
-            return replace(state, position=position, velocity=velocity), empty
-        flags = {name: _like(getattr(state, name)) for name in ("touching_agent", "touching_obstacle", "touching_wall")}
-        counts = {name: _like(value) for name, value in vars(empty).items()}
-        *changed, contacts = jax.pure_callback(
-            self._advance_with_contacts,
-            (*bodies.values(), *flags.values(), counts),
-            state,
-            acceleration,
-            vmap_method="sequential",
+            out = jax.pure_callback(self._advance, moved, bodies, state.obstacle, vmap_method="sequential")
+            return replace(state, position=out[..., :2], velocity=out[..., 2:]), no_contacts(scenes, agents)
+        flags = jnp.concatenate(
+            [state.touching_agent[..., None], state.touching_wall[..., None], state.touching_obstacle], axis=-1
         )
-        return replace(state, **dict(zip([*bodies, *flags], changed, strict=True))), Contacts(**contacts)
+        shapes = (
+            moved,
+            jax.ShapeDtypeStruct(flags.shape, flags.dtype),
+            jax.ShapeDtypeStruct((len(_COUNTS), scenes, agents), np.int32),
+            jax.ShapeDtypeStruct((len(_DEPTHS), scenes, agents), np.float32),
+        )
+        out, flags, counts, depths = jax.pure_callback(
+            self._advance_with_contacts, shapes, bodies, state.obstacle, flags, vmap_method="sequential"
+        )
+        state = replace(
+            state,
+            position=out[..., :2],
+            velocity=out[..., 2:],
+            touching_agent=flags[..., 0],
+            touching_wall=flags[..., 1],
+            touching_obstacle=flags[..., 2:],
+        )
+        fields = dict(zip(_COUNTS + _DEPTHS, [*counts, *depths], strict=True))
+        return state, Contacts(**fields)
 
     @contextlib.contextmanager
-    def _loaded(self, state: State, acceleration: Array) -> Iterator[_Worker]:
-        """A worker whose batch holds the given state and controls; back in the pool afterwards."""
-        scenes = state.position.shape[0]
+    def _loaded(self, bodies: np.ndarray, obstacle: np.ndarray) -> Iterator[_Worker]:
+        """A worker whose batch holds the given states and controls (S, N, 6); back in the pool afterwards."""
+        scenes = bodies.shape[0]
         pool, index = self._pool[scenes], self._index
         try:
             worker = pool.popleft()  # atomic: a deque is safe between threads
@@ -83,27 +97,31 @@ class NativeEngine:
             worker = _Worker(Batch(self._model, scenes, self._threads))
             worker.batch.bind("sensordata")
         batch = worker.batch
-        batch.qpos[:, index.qpos] = np.asarray(state.position).reshape(scenes, -1)
-        batch.qvel[:, index.dof] = np.asarray(state.velocity).reshape(scenes, -1)
-        batch.ctrl[:, index.control] = np.asarray(acceleration).reshape(scenes, -1)
-        batch.mocap_pos[:, index.obstacle_mocap, :2] = np.asarray(state.obstacle)
+        batch.qpos[:, index.qpos] = bodies[..., 0:2].reshape(scenes, -1)
+        batch.qvel[:, index.dof] = bodies[..., 2:4].reshape(scenes, -1)
+        batch.ctrl[:, index.control] = bodies[..., 4:6].reshape(scenes, -1)
+        batch.mocap_pos[:, index.obstacle_mocap, :2] = obstacle
         batch.qacc_warmstart[:] = 0
         yield worker
         pool.append(worker)  # a worker of a call that raised is dropped
 
-    def _bodies(self, batch: Batch, like: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        position = batch.qpos[:, self._index.qpos].astype(like.dtype).reshape(like.shape)
-        return position, batch.qvel[:, self._index.dof].astype(like.dtype).reshape(like.shape)
+    def _moved(self, batch: Batch, bodies: np.ndarray) -> Float[np.ndarray, "S N 4"]:
+        moved = np.empty((*bodies.shape[:2], 4), bodies.dtype)
+        moved[..., :2] = batch.qpos[:, self._index.qpos].reshape(*bodies.shape[:2], 2)
+        moved[..., 2:] = batch.qvel[:, self._index.dof].reshape(*bodies.shape[:2], 2)
+        return moved
 
-    def _advance(self, state: State, acceleration: Array):
-        with self._loaded(state, acceleration) as worker:
+    def _advance(self, bodies: Array, obstacle: Array) -> np.ndarray:
+        bodies = np.asarray(bodies)
+        with self._loaded(bodies, np.asarray(obstacle)) as worker:
             worker.batch.step(nstep=self.spec.substeps)
-            return self._bodies(worker.batch, np.asarray(state.position))
+            return self._moved(worker.batch, bodies)
 
-    def _advance_with_contacts(self, state: State, acceleration: Array):
+    def _advance_with_contacts(self, bodies: Array, obstacle: Array, flags: Array) -> tuple[np.ndarray, ...]:
+        bodies, obstacle, flags = np.asarray(bodies), np.asarray(obstacle), np.asarray(flags)
         k, index = self.spec.substeps, self._index
-        scenes = state.position.shape[0]
-        with self._loaded(state, acceleration) as worker:
+        scenes, agents = bodies.shape[:2]
+        with self._loaded(bodies, obstacle) as worker:
             batch = worker.batch
             if k == 1:
                 batch.step()
@@ -114,44 +132,44 @@ class NativeEngine:
                 # A sensor record describes the state before its substep: records 1.. are states 1..k-1.
                 recorded, positions = worker.records["sensordata"][:, 1:], worker.records["qpos"]
                 touched = recorded[..., index.touch].any(axis=(1, 2))
-            near = self._near(batch, np.asarray(state.obstacle))
+            moved = self._moved(batch, bodies)
+            near = self._near(moved, obstacle)
             batch.forward(ids=np.flatnonzero(near), stage=mujoco.mjtStage.mjSTAGE_VEL.value)  # state k
-            position, velocity = self._bodies(batch, np.asarray(state.position))
 
             # Scenes where nothing touches, most of them, are done: zeros.
+            now = np.zeros_like(flags)
+            counts = np.zeros((len(_COUNTS), scenes, agents), np.int32)
+            depths = np.zeros((len(_DEPTHS), scenes, agents), np.float32)
             rows = np.flatnonzero(touched | near)
-            last = np.where(near[rows, None, None], batch.sensordata[rows, None], 0)
-            sensors = np.concatenate([recorded[rows], last], axis=1)
-            before = (state.touching_agent, state.touching_obstacle, state.touching_wall)
-            before = (np.asarray(before[0])[rows], np.asarray(before[1])[rows], np.asarray(before[2])[rows])
-            flags, on_agent, fields = read_sensors(np, sensors, before, index, self.spec)
-            fields["agent_depth"] = self._agent_depth(on_agent, positions[rows])
+            if len(rows):
+                last = np.where(near[rows, None, None], batch.sensordata[rows, None], 0)
+                sensors = np.concatenate([recorded[rows], last], axis=1)
+                before = (flags[rows, :, 0], flags[rows, :, 2:], flags[rows, :, 1])
+                (agent, solid, wall), on_agent, fields = read_sensors(np, sensors, before, index, self.spec)
+                fields["agent_depth"] = self._agent_depth(on_agent, positions[rows])
+                now[rows] = np.concatenate([agent[..., None], wall[..., None], solid], axis=-1)
+                counts[:, rows] = [fields[name] for name in _COUNTS]
+                depths[:, rows] = [fields[name] for name in _DEPTHS]
+        return moved, now, counts, depths
 
-        def spread(part: np.ndarray) -> np.ndarray:
-            whole = np.zeros((scenes, *part.shape[1:]), part.dtype)
-            whole[rows] = part
-            return whole
-
-        return position, velocity, *map(spread, flags), {name: spread(part) for name, part in fields.items()}
-
-    def _near(self, batch: Batch, obstacle: np.ndarray) -> np.ndarray:
+    def _near(self, moved: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
         """(S,) whether two bodies may touch; where not, all sensors of this state are zero for sure."""
         spec = self.spec
         if spec.num_agents > _BROADPHASE_AGENTS:
-            return np.ones(batch.nsim, bool)
-        position = batch.qpos[:, self._index.qpos].astype(np.float32).reshape(batch.nsim, spec.num_agents, 2)
-        slack = 0.01  # far above float32's rounding of a distance in an arena
-        reach = np.float32((2 * spec.agent_radius + slack) ** 2)
-        near = np.zeros(batch.nsim, bool)
+            return np.ones(len(moved), bool)
+        x, y = np.ascontiguousarray(moved[..., :2].transpose(2, 1, 0))  # (N, S) each: whole rows at a time
+        near = np.zeros(len(moved), bool)
+
+        def add(dx: np.ndarray, dy: np.ndarray, reach: float) -> None:
+            np.logical_or(near, (dx * dx + dy * dy < np.float32(reach + _SLACK) ** 2).any(axis=0), out=near)
+
         for shift in range(1, spec.num_agents):
-            apart = position[:, shift:] - position[:, :-shift]
-            near |= (np.einsum("snd,snd->sn", apart, apart) < reach).any(axis=1)
-        reach = np.float32((spec.agent_radius + spec.obstacle_radius + slack) ** 2)
+            add(x[shift:] - x[:-shift], y[shift:] - y[:-shift], 2 * spec.agent_radius)
         for k in range(spec.num_obstacles):
-            apart = position - obstacle[:, k : k + 1].astype(np.float32)
-            near |= (np.einsum("snd,snd->sn", apart, apart) < reach).any(axis=1)
+            add(x - obstacle[:, k, 0], y - obstacle[:, k, 1], spec.agent_radius + spec.obstacle_radius)
         if spec.walls:
-            near |= (np.abs(position) > spec.arena - spec.agent_radius - slack).any(axis=(1, 2))
+            border = spec.arena - spec.agent_radius - _SLACK
+            near |= (np.maximum(np.abs(x), np.abs(y)) > border).any(axis=0)
         return near
 
     def _agent_depth(self, on_agent: np.ndarray, recorded: np.ndarray) -> np.ndarray:

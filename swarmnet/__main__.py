@@ -1,0 +1,7 @@
+"""`python -m swarmnet`."""
+
+import sys
+
+from swarmnet.cli import main
+
+sys.exit(main())

@@ -1,0 +1,76 @@
+"""`swarmnet COMMAND`: parses with the standard-library configurations, and only then imports what the command needs."""
+
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, Union
+
+import tyro
+
+from swarm_mjcf.errors import SwarmError
+from swarmnet.config import Bench, Command, Demo, Doctor, Evaluate, Render, Report, Simulate, Train
+
+_MODULES: dict[type, str] = {
+    Simulate: "swarmnet.commands.simulate",
+    Train: "swarmnet.commands.train",
+    Evaluate: "swarmnet.commands.evaluate",
+    Render: "swarmnet.commands.render",
+    Demo: "swarmnet.commands.demo",
+    Report: "swarmnet.commands.report",
+    Doctor: "swarmnet.commands.doctor",
+    Bench: "swarmnet.commands.bench",
+}
+"""Each has a function `run(config) -> int`, the exit code."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command. Exit codes: 0 done, 1 a check failed, 2 bad input or no way to write, 130 interrupted."""
+    try:
+        config = parse(sys.argv[1:] if arguments is None else arguments)
+        _prepare()
+        return importlib.import_module(_MODULES[type(config)]).run(config)
+    except SwarmError as error:
+        return _fail(str(error))
+    except OSError as error:
+        return _fail(f"{error.filename or ''}: {error.strerror or error}".lstrip(": "))
+    except KeyboardInterrupt:
+        print("\nswarmnet: interrupted; the same command goes on from what is saved", file=sys.stderr)
+        return 130
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """The configuration that the arguments describe; prints help or an error and exits otherwise."""
+    overview = not arguments or arguments[0] in ("-h", "--help")
+    kinds = tuple(
+        Annotated[kind, tyro.conf.subcommand(kind.__name__.lower(), description=_help(kind, only_first=overview))]
+        for kind in _MODULES
+    )
+    commands: Any = Union[kinds]  # noqa: UP007  (built from a tuple)
+    return tyro.cli(
+        commands,
+        prog="swarmnet",
+        description="Simulate swarms in MuJoCo, learn their law with a graph network, judge it by contacts.\n\n"
+        "Start with:  swarmnet demo        Then:  swarmnet COMMAND --help",
+        args=list(arguments),
+        config=(tyro.conf.PositionalRequiredArgs,),
+    )
+
+
+def _help(kind: type, *, only_first: bool) -> str:
+    text = inspect.cleandoc(kind.__doc__ or "")
+    return text.split("\n\n")[0] if only_first else text
+
+
+def _prepare() -> None:
+    """Environment that libraries read when they are first imported."""
+    os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+def _fail(message: str) -> int:
+    print(f"swarmnet: {message}", file=sys.stderr)
+    return 2

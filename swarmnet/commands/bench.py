@@ -1,0 +1,109 @@
+"""`swarmnet bench`: prints `name.metric value` lines; what is compared is measured in the same run."""
+
+import tempfile
+import time
+from pathlib import Path
+
+from envs.config import SimulateConfig
+from envs.simulate import simulate_in_memory
+from gnn.config import TrainConfig
+from gnn.decode import make_predict
+from gnn.evaluate import constant_velocity, persistence, prediction_error
+from gnn.train import train
+from swarm_mjcf.build import compile_scene
+from swarm_mjcf.spec import SceneSpec
+from swarmnet.bench_engines import bench_engines
+from swarmnet.commands.train import note
+from swarmnet.config import Bench
+from swarmnet.progress import progress
+from swarmnet.results import Results, Row, write_results
+
+THESIS = {"published_mean 5 steps": 0.2338, "published_mean 40 steps": 2.778}
+"""Table 3.1, SwarmNet with context on Boids, after 50K demonstrations."""
+
+
+def run(config: Bench) -> int:
+    """Measures what was asked for."""
+    name, dt, seeds = f"bench-{config.what}", None, []
+    match config.what:
+        case "engines":
+            rows = _engines(config)
+        case "imitation":
+            rows, dt, seeds = _imitation(config), 0.3, [config.seed]
+        case "rendering":
+            from swarm_mjcf.render_bench import run as bench_rendering
+
+            rows = [Row("render", metric, value) for metric, value in bench_rendering()]
+            for row in rows:
+                print(f"{row.column} {row.value:.4g}")
+        case "build":
+            rows = _build()
+    if config.json:
+        write_results(config.json, Results(name=name, rows=rows, dt=dt, seeds=seeds))
+    return 0
+
+
+def _engines(config: Bench) -> list[Row]:
+    rows = []
+    for rate in bench_engines(config.agents, config.substeps, repeats=config.repeats):
+        if isinstance(rate, str):
+            print(rate, flush=True)
+            continue
+        column = f"N={rate.agents} k={rate.substeps}"
+        where = f"engines.{rate.case.replace(' + ', '_')}.n{rate.agents}.k{rate.substeps}"
+        print(f"{where}.scene_steps_per_second {rate.per_second:.0f}")
+        print(f"{where}.ratio_to_bare {rate.ratio:.3f}", flush=True)
+        rows.append(Row(rate.case, f"{column} scene-steps/s", rate.per_second, unit="1/s"))
+        rows.append(Row(rate.case, f"{column} ratio to bare", rate.ratio, unit="1"))
+        rows.append(Row(rate.case, f"{column} scenes", rate.scenes, unit="scenes"))
+    return rows
+
+
+def _imitation(config: Bench) -> list[Row]:
+    """Published Boids, contacts off: simulate, train, predict unseen runs."""
+    rows: list[Row] = []
+
+    def show(row: str, column: str, value: float | int, unit: str, reference: float | None = None) -> None:
+        rows.append(Row(row, column, value, reference=reference, unit=unit))
+        metric = f"imitation.{row}.{column}".replace(" ", "_")
+        print(f"{metric} {value:.4g}" + ("" if reference is None else f"  (thesis {reference})"), flush=True)
+
+    data = SimulateConfig(preset="published", scenes=config.scenes, seed=config.seed)
+    begun = time.monotonic()
+    trajectories = simulate_in_memory(data)
+    show("simulate", "seconds", time.monotonic() - begun, "s")
+    unseen = simulate_in_memory(SimulateConfig(preset="published", scenes=200, seed=config.seed + 1_000_000))
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder, progress("train best") as update:
+        model = train(
+            TrainConfig(seed=config.seed).scaled(config.scale),
+            trajectories,
+            Path(folder),
+            validation=unseen,
+            progress=lambda done, total, row: update(done, total, note(row)),
+        )
+    show("train", "seconds", time.monotonic() - begun, "s")
+    show("train", "runs", config.scenes, "trajectories")
+    predictors = {
+        "swarmnet best": (make_predict(model.config, model.scales, model.integrator), model.params),
+        "constant velocity": (constant_velocity(model.integrator.dt), {}),
+        "persistence": (persistence, {}),
+    }
+    for name, (predict, params) in predictors.items():
+        error = prediction_error(predict, params, unseen, window=1)
+        for kind in ("published_mean", "published_median", "agents_mean", "agents_median"):
+            for horizon, value in zip(error.horizons, getattr(error, kind), strict=True):
+                column = f"{kind} {horizon} steps"
+                reference = THESIS.get(column) if name.startswith("swarmnet") else None
+                show(name, column, value, "normalized MSE", reference)
+    return rows
+
+
+def _build() -> list[Row]:
+    """Seconds for 1000 scenes of 20 agents from specification to compiled model, on one core."""
+    begun = time.perf_counter()
+    for arena in range(1000):  # 1000 different scenes
+        compile_scene(SceneSpec(num_agents=20, arena=100.0 + arena))
+    seconds = time.perf_counter() - begun
+    print(f"build.seconds_per_1000_scenes_of_20 {seconds:.3f}")
+    return [Row("build", "seconds per 1000 scenes of 20 agents", seconds, unit="s")]

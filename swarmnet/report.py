@@ -1,0 +1,400 @@
+"""RUN/report.html: one self-contained page of what a run folder holds. Its fixed words are in report.html."""
+
+import base64
+import json
+import mimetypes
+import platform
+import re
+import shlex
+from dataclasses import MISSING, dataclass, fields
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from envs.storage import load
+from envs.trajectories import versions
+from gnn.checkpoint import Checkpoints
+from gnn.config import TrainConfig
+from gnn.metrics import read_metrics
+from swarm_mjcf.errors import SwarmError
+from swarmnet.config import Demo, Evaluate, Simulate, Train
+from swarmnet.figures import FigureFile, make_figures, read_evaluation
+from swarmnet.results import commit, hardware, write_whole
+from swarmnet.videos import VideoFile, find_videos
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a run folder says; None where it holds nothing of the kind."""
+
+    run: Path
+    about: dict | None
+    """Of the newest checkpoint."""
+    evaluation: dict | None
+    metrics: list[dict]
+    counts: tuple[int, int, int] | None
+    """Goals, obstacles and agents of the judged scenes."""
+    demo: dict | None
+    """Settings of `swarmnet demo`, when it made the folder."""
+
+    @property
+    def model(self) -> str:
+        """The model's row name: the first row of the prediction table."""
+        return next(iter(self.evaluation["prediction"])) if self.evaluation else "model"
+
+    def pair(self, figure: str) -> tuple[dict, dict] | None:
+        """Estimates of the model and of the expert, where both were measured; contact figures only with contacts on."""
+        e = self.evaluation or {}
+        reports = e.get("collisions") or {}
+        if not {"expert", self.model} <= set(reports) or ("contact" in figure and not e.get("contacts")):
+            return None
+        both = reports[self.model].get(figure), reports["expert"].get(figure)
+        return both if all(both) else None
+
+
+def write_report(run: str | Path) -> Path:
+    """Writes RUN/report.html from whatever is there, with the figures renewed; names the commands that make the rest.
+
+    Raises:
+      SwarmError: there is no such folder, or a file in it cannot be read or written.
+    """
+    run = Path(run)
+    if not run.is_dir():
+        raise SwarmError(f"{run}: no such run folder; `swarmnet demo` makes one")
+    facts = _gather(run)
+    page = _filled(
+        {
+            "title": escape(f"Run {run.resolve().name}"),
+            "run": escape(shlex.quote(str(run))),
+            "css": resources.files("swarmnet").joinpath("report.css").read_text(encoding="utf-8"),
+            "lead": _lead(facts),
+            "tiles": _tiles(facts),
+            **_missing(facts),
+            "figures": "".join(_figure(figure) for figure in make_figures(run)),
+            "videos": "".join(_video(video, first=not k) for k, video in enumerate(find_videos(run))),
+            **_prediction(facts),
+            **_collisions(facts),
+            "settings": _settings(facts),
+            "again": "\n".join(f"{escape(line)}  <i># {escape(why)}</i>" for line, why in commands(facts)),
+            **_notes(facts),
+        }
+    )
+    write_whole(run / "report.html", page)
+    return run / "report.html"
+
+
+def _filled(values: dict[str, str]) -> str:
+    """The template with its values; sections, rows and items whose id has none are left out."""
+    text = resources.files("swarmnet").joinpath("report.html").read_text(encoding="utf-8")
+    for tag in ("section", "tr", "li"):
+        blocks = re.compile(rf'<{tag} id="(\w+)">.*?</{tag}>\n', re.DOTALL)
+        text = blocks.sub(lambda block: block[0] if values.get(block[1]) else "", text)
+    return Template(text).substitute(values)
+
+
+def _gather(run: Path) -> Facts:
+    about = counts = demo = None
+    if (run / "checkpoints").is_dir():
+        checkpoints = Checkpoints(run / "checkpoints")
+        latest = checkpoints.latest()
+        about = None if latest is None else checkpoints.about(latest) | {"step": latest}
+        checkpoints.close()
+    if (run / "rollouts" / "expert.h5").exists():
+        counts = load(run / "rollouts" / "expert.h5", scenes=1).counts
+    if (run / "config.json").exists():
+        try:
+            demo = json.loads((run / "config.json").read_text())
+        except (OSError, ValueError) as error:
+            raise SwarmError(f"{run / 'config.json'}: cannot be read ({error})") from error
+    return Facts(run, about, read_evaluation(run), read_metrics(run / "metrics.jsonl"), counts, demo)
+
+
+def _lead(facts: Facts) -> str:
+    """One paragraph in plain words."""
+    said = []
+    if facts.about:
+        data, train = facts.about["data"], facts.about["train"]
+        source = f"the {data['expert'].title()} expert" if "expert" in data else "recorded agents"
+        world = f" in the world <code>{escape(str(data['simulate']['preset']))}</code>" if "simulate" in data else ""
+        said.append(
+            f"A SwarmNet (preset <code>{escape(facts.about['preset'])}</code>) watched {data['scenes']} scenes of "
+            f"{escape(source)}{world} and was trained for {facts.about['step']} gradient steps{_minutes(facts)}, on "
+            f"predictions of up to {max(train['horizons'])} steps."
+        )
+    if facts.evaluation:
+        e, (_, obstacles, agents) = facts.evaluation, facts.counts or (0, 0, 0)
+        crowd = f", {agents} agent{'s' * (agents != 1)} and {obstacles} obstacle{'s' * (obstacles != 1)} in each"
+        said.append(
+            f"It was judged on {e['scenes']} scenes that it had never seen (seed {e['seed']}), {e['steps']} control "
+            f"steps of {e['dt']:g} s each{crowd if agents else ''}."
+        )
+        if both := facts.pair("final_goal_distance"):
+            said.append(
+                f"Steering the agents itself in MuJoCo, it ends {_value(both[0])} from the goal on average; the "
+                f"expert, from the same starts, {_value(both[1])}{_overlap(*both)}."
+            )
+        if both := facts.pair("contact_steps_any"):
+            said.append(
+                f"Something touches in {_value(both[0])} of its control steps, in {_value(both[1])} of the expert's"
+                f"{_overlap(*both)}."
+            )
+        rows = e["prediction"]
+        first, *others = rows
+        near = [h for h in (5, 40) if h in rows[first]["horizons"]]
+        if near:
+            parts = [
+                f"{_number(_error(rows[first], h))} at {h} steps ("
+                + ", ".join(f"{escape(name)} {_number(_error(rows[name], h))}" for name in others) + ")"
+                for h in near
+            ]  # fmt: skip
+            said.append("Predicting without ever being corrected, its normalized error is " + " and ".join(parts) + ".")
+    return " ".join(said) or "This folder holds no trained model and no evaluation yet."
+
+
+def _minutes(facts: Facts) -> str:
+    """Time spent in gradient steps and validation, from the metrics."""
+    before = [0, *(row["step"] for row in facts.metrics)]
+    seconds = sum((r["step"] - b) / r["steps_per_second"] for b, r in zip(before, facts.metrics, strict=False))
+    return f" ({seconds / 60:.1f} minutes)" if seconds >= 60 else f" ({seconds:.0f} seconds)" if seconds else ""
+
+
+def _overlap(one: dict, other: dict) -> str:
+    if None in (one["low"], one["high"], other["low"], other["high"]):
+        return ""
+    if one["low"] <= other["high"] and other["low"] <= one["high"]:
+        return " (the 95% intervals overlap)"
+    return f" (the 95% intervals are apart: {'more' if one['low'] > other['high'] else 'less'} than the expert)"
+
+
+def _tiles(facts: Facts) -> str:
+    """The key numbers, large."""
+    tiles = []
+
+    def tile(label: str, value: str, beside: str) -> None:
+        tiles.append(f'<div class="tile"><span>{label}</span><b>{value}</b><small>{beside}</small></div>')
+
+    labels = {
+        "final_goal_distance": "Distance to the goal at the end",
+        "contact_steps_any": "Control steps with a contact",
+    }
+    for figure, label in labels.items():
+        if both := facts.pair(figure):
+            tile(label, _value(both[0], interval=False), f"model, {_interval(both[0])}<br>expert {_value(both[1])}")
+    if facts.evaluation:
+        rows = facts.evaluation["prediction"]
+        name, *others = rows
+        for horizon in (5, 40):
+            if horizon in rows[name]["horizons"]:
+                beside = "<br>".join(f"{escape(other)} {_number(_error(rows[other], horizon))}" for other in others)
+                label = f"Prediction error, {horizon} steps"
+                tile(label, _number(_error(rows[name], horizon)), beside)
+    return "".join(tiles)
+
+
+def _missing(facts: Facts) -> dict[str, str]:
+    """What is not there and could be."""
+    steered = (facts.run / "rollouts" / "learned.h5").exists()
+    found = {
+        "no_model": "" if facts.about else "yes",
+        "no_evaluation": "" if facts.evaluation else "yes",
+        "no_videos": escape(_render(facts.run)) if steered and not find_videos(facts.run) else "",
+    }
+    return found | {"missing": "".join(found.values())}
+
+
+def _video(video: VideoFile, *, first: bool) -> str:
+    """A video in the page; the first one plays by itself, silently."""
+    source, title = _data_uri(video.path), escape(video.title)
+    if video.path.suffix == ".gif":
+        picture = f'<img src="{source}" alt="{title}">'
+    else:
+        poster = f' poster="{_data_uri(video.poster)}"' if video.poster else ""
+        options = f'controls muted loop playsinline{" autoplay" if first else ""} preload="metadata"{poster}'
+        picture = f'<video {options} aria-label="{title}"><source src="{source}" type="video/mp4"></video>'
+    return f"<figure>{picture}<figcaption>{title}</figcaption></figure>"
+
+
+def _figure(figure: FigureFile) -> str:
+    """A figure in the page, in the shape for the screen's width."""
+    small = f'<source media="(max-width: 760px)" srcset="{_data_uri(figure.narrow)}">' if figure.narrow else ""
+    image = f'<picture>{small}<img src="{_data_uri(figure.path)}" alt="{escape(figure.title)}"></picture>'
+    parts = escape(figure.caption).split("`")
+    caption = "".join(f"<code>{part}</code>" if number % 2 else part for number, part in enumerate(parts))
+    kind = "plot wide" if figure.narrow else "plot"
+    return f'<figure class="{kind}"><h3>{escape(figure.title)}</h3>{image}<figcaption>{caption}</figcaption></figure>'
+
+
+def _prediction(facts: Facts) -> dict[str, str]:
+    """The two tables of prediction error."""
+    if not facts.evaluation:
+        return {}
+    e = facts.evaluation
+    return {
+        "prediction": _error_table(e["prediction"], "published", facts.model),
+        "prediction_agents": _error_table(e["prediction"], "agents", facts.model),
+        "prediction_of": f"dt = {e['dt']:g} s, {e['scenes']} unseen scenes",
+    }
+
+
+def _error_table(rows: dict[str, dict], metric: str, model: str) -> str:
+    horizons = rows[model]["horizons"]
+    head = "".join(f"<th>{h} step{'s' * (h > 1)}</th>" for h in horizons)
+    lines = []
+    for name, error in rows.items():
+        pairs = zip(error[f"{metric}_mean"], error[f"{metric}_median"], strict=True)
+        cells = "".join(f"<td>{_number(mean)}<br><small>{_number(median)}</small></td>" for mean, median in pairs)
+        kind = ' class="model"' if name == model else ""
+        lines.append(f"<tr{kind}><th>{escape(name)}</th>{cells}</tr>")
+    windows = "".join(f"<td><small>{count}</small></td>" for count in rows[model]["windows"])
+    lines.append(f"<tr><td><small>windows</small></td>{windows}</tr>")
+    table = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(lines)}</tbody>"
+    return f'<div class="table"><table>{table}</table></div>'
+
+
+def _collisions(facts: Facts) -> dict[str, str]:
+    """Cells of each figure by its name; the template has a row for each (tested)."""
+    reports = (facts.evaluation or {}).get("collisions")
+    if not reports:
+        return {}
+    cells = {
+        figure: "".join(
+            f"<td>{_value(estimate, interval=False)}<br>{_interval(estimate)}</td>"
+            for estimate in (report[figure] for report in reports.values())
+        )
+        for figure in next(iter(reports.values()))
+    }
+    return cells | {"collisions": "".join(f"<th>{escape(name)}</th>" for name in reports)}
+
+
+def _settings(facts: Facts) -> str:
+    """Everything that was set, as cards that open."""
+    e, about = facts.evaluation or {}, facts.about or {}
+    data = about.get("data", {})
+    world = data.get("world", {})
+    judged = {key: e.get(key) for key in ("preset", "engine", "scenes", "steps", "dt", "seed", "contacts")}
+    counts = dict(zip(("goals", "obstacles", "agents"), facts.counts or (), strict=False))
+    software = {"commit": e.get("commit") or commit(), "python": platform.python_version()}
+    cards: dict[str, dict[str, Any]] = {
+        "Training data": {"scenes trained on": data.get("scenes"), "expert": data.get("expert")}
+        | data.get("simulate", {}),
+        "World: scene": world.get("scene", {}),
+        "World: expert and start": world.get("boids", {}) | world.get("spawn", {}),
+        "Model": {"preset": about.get("preset")} | about.get("model", {}),
+        "Training": {"steps done": about.get("step")} | about.get("train", {}),
+        "Evaluation": judged | counts,
+        "Software": software | (e.get("versions") or data.get("versions") or versions()),
+        "Hardware" + ("" if "hardware" in e else " that wrote this page"): e.get("hardware") or hardware(),
+    }
+    shown = []
+    for title, values in cards.items():
+        known = {k: v for k, v in values.items() if v is not None}
+        items = "".join(f"<dt>{escape(k)}</dt><dd>{escape(_plain(v))}</dd>" for k, v in known.items())
+        if items:
+            shown.append(f'<details class="card"><summary>{escape(title)}</summary><dl>{items}</dl></details>')
+    return "".join(shown)
+
+
+def commands(facts: Facts) -> list[tuple[str, str]]:
+    """(command, what it makes) for everything on the page, in order; all of them parse."""
+    run, about, e = facts.run, facts.about or {}, facts.evaluation
+    data = run / "data.h5"
+    found = []
+    if facts.demo and {"name", "scenes", "test_scenes"} <= set(facts.demo):
+        known = {k: v for k, v in facts.demo.items() if k != "videos"}
+        found.append((["swarmnet", "demo", *_flags(Demo, known)], "everything on this page"))
+    elif "simulate" in about.get("data", {}):
+        simulated = {k: v for k, v in about["data"]["simulate"].items() if k not in ("threads", "chunk")}
+        found.append((["swarmnet", "simulate", *_flags(Simulate, simulated | {"out": data})], "training data"))
+        all_scenes, kept = simulated["scenes"], simulated["scenes"] - about["data"]["scenes"]
+        train: dict[str, Any] = about["train"] | {"run": run}
+        if 0 < kept < all_scenes and kept != max(1, round(0.05 * all_scenes)):
+            train["validation"] = kept / all_scenes
+        found.append((["swarmnet", "train", str(data), *_flags(Train, train)], "model and learning curves"))
+    if e:
+        judged = {key: e[key] for key in ("scenes", "steps", "seed", "preset") if key in e}
+        found.append((["swarmnet", "evaluate", str(run), *_flags(Evaluate, judged)], "rollouts, tables, figures"))
+    found.append((["swarmnet", "report", str(run)], "this page and figures/"))
+    lines = [(shlex.join(words), comment) for words, comment in found]
+    return [*lines, (_render(run), "one video")] if (run / "rollouts" / "learned.h5").exists() else lines
+
+
+def _render(run: Path) -> str:
+    rollouts = run / "rollouts"
+    words = ["swarmnet", "render", str(rollouts / "expert.h5"), "--beside", str(rollouts / "learned.h5")]
+    return shlex.join([*words, "--scene", "0", "--out", str(run / "videos" / "mine.mp4")])
+
+
+def _flags(kind: type, values: dict[str, Any]) -> list[str]:
+    """Command-line flags for the values that differ from a configuration's defaults; None means the default."""
+    words: list[str] = []
+    for field in fields(kind):
+        value = values.get(field.name)
+        value = tuple(value) if isinstance(value, list) else value
+        if value is None or field.default is MISSING or value == field.default:
+            continue
+        flag = field.name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            words += [f"--{flag}", *(str(item) for item in (value if isinstance(value, tuple) else (value,)))]
+    return words
+
+
+def _notes(facts: Facts) -> dict[str, str]:
+    """Which of the template's notes hold, with their numbers."""
+    e, about = facts.evaluation, facts.about
+    planned = sum(about["train"]["stage_steps"]) if about else 0
+    full = TrainConfig().steps
+    found = {
+        "note_contacts_off": e and not e.get("contacts", True),
+        "note_cannot_steer": e and not e.get("collisions"),
+        "note_one_seed": e,
+        "note_open_loop": e and e.get("collisions"),
+        "note_unfinished": f"{about['step']} of {planned}" if about and about["step"] < planned else "",
+        "note_short": f"{planned / full:.0%} of the full {full}" if planned and planned < full else "",
+    }
+    words = {name: value if isinstance(value, str) else "yes" if value else "" for name, value in found.items()}
+    return words | {"notes": "".join(words.values())}
+
+
+def _error(row: dict, horizon: int) -> float | None:
+    """The published mean at a horizon."""
+    return row["published_mean"][row["horizons"].index(horizon)] if horizon in row["horizons"] else None
+
+
+def _number(value: float | int | None) -> str:
+    """Three significant digits; a dash for what is not a number."""
+    if value is None or value != value:
+        return "–"
+    if 1000 <= abs(value) < 1e6 or value == 0:
+        return f"{value:.0f}"
+    return f"{value:#.3g}".removesuffix(".") if abs(value) >= 1 else f"{value:.3g}"
+
+
+def _value(estimate: dict, *, interval: bool = True) -> str:
+    share = estimate["unit"] == "share"
+    value = _number(None if estimate["value"] is None else estimate["value"] * (100 if share else 1))
+    shown = f"{value}&nbsp;{'%' if share else escape(estimate['unit'])}".removesuffix("&nbsp;")
+    return f"{shown} {_interval(estimate)}".strip() if interval else shown
+
+
+def _interval(estimate: dict) -> str:
+    if estimate["low"] is None or estimate["high"] is None:
+        return ""
+    scale = 100 if estimate["unit"] == "share" else 1
+    return f"<span class=range>[{_number(estimate['low'] * scale)}, {_number(estimate['high'] * scale)}]</span>"
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(item) for item in value) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _data_uri(path: Path) -> str:
+    kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"

@@ -1,0 +1,142 @@
+"""Machine-readable results, the same for every command that measures, with all that is needed to measure again."""
+
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from envs.trajectories import versions
+from swarm_mjcf.errors import SwarmError
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure. `std` and `reference` (the thesis's figure) are None where there is none."""
+
+    row: str
+    column: str
+    value: float | int
+    std: float | None = None
+    reference: float | None = None
+    unit: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """What a measuring command found."""
+
+    name: str
+    rows: list[Row]
+    dt: float | None
+    """Control step [s]; None where it has no meaning."""
+    seeds: list[int]
+    profile: str = "default"
+
+
+def write_results(path: str | Path, results: Results) -> None:
+    """Writes JSON, whole or not at all. Non-finite values become null."""
+    path = Path(path)
+    rows = [
+        {k: None if isinstance(v, float) and v - v != 0 else v for k, v in asdict(row).items()} for row in results.rows
+    ]
+    document = {
+        "name": results.name,
+        "command": " ".join(["swarmnet", *sys.argv[1:]]),
+        "commit": commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "profile": results.profile,
+        "hardware": hardware(),
+        "versions": {"python": platform.python_version(), **versions()},
+        "dt": results.dt,
+        "seeds": results.seeds,
+        "rows": rows,
+    }
+    write_whole(path, json.dumps(document, indent=1) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes a text file under a temporary name and renames it. Raises SwarmError with the reason."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(text)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True) if partial.parent.is_dir() else None
+        raise SwarmError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def hardware() -> dict:
+    """Processor, cores, memory, and JAX's devices."""
+    import jax
+
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        lines = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        model = lines[0].split(":", 1)[1].strip() if lines else model
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30 if hasattr(os, "sysconf") else None
+    return {
+        "cpu": model,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gib": None if memory is None else round(memory, 1),
+        "devices": sorted({device.device_kind for device in jax.devices()}),
+    }
+
+
+def commit() -> str | None:
+    """Commit of the checkout this file lies in, with `+` when it has changes; None for an installed package."""
+    here = Path(__file__).resolve().parent
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],
+            cwd=here, capture_output=True, text=True, check=True, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip()
+
+
+def render_page(folder: str | Path) -> str:
+    """docs/results.md from the committed docs/results/*.json: a table for each, with what it was measured on."""
+    lines = [
+        "# Results",
+        "",
+        "Rendered from `docs/results/*.json` by `make docs`; every file was written by the command it names.",
+    ]
+    for path in sorted(Path(folder).glob("*.json")):
+        document = json.loads(path.read_text())
+        machine, used = document["hardware"], document["versions"]
+        columns = list(dict.fromkeys(row["column"] for row in document["rows"]))
+        names = list(dict.fromkeys(row["row"] for row in document["rows"]))
+        cells = {(row["row"], row["column"]): row for row in document["rows"]}
+        lines += [
+            "",
+            f"## {document['name']}",
+            "",
+            f"`{document['command']}`, commit {document['commit']}, {document['date'][:10]}, {machine['cpu']} with "
+            f"{machine['cores']} cores, {', '.join(machine['devices'])}, mujoco {used['mujoco']}, jax {used['jax']}"
+            + (f", dt {document['dt']} s" if document["dt"] else "")
+            + (f", seeds {', '.join(map(str, document['seeds']))}" if document["seeds"] else ""),
+            "",
+            "| | " + " | ".join(names) + " |",
+            "|---|" + "---:|" * len(names),
+        ]
+        for column in columns:
+            lines.append(f"| {column} | " + " | ".join(_cell(cells.get((name, column))) for name in names) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row: dict | None) -> str:
+    if row is None or row["value"] is None:
+        return ""
+    text = f"{row['value']:.4g}" + (f" ± {row['std']:.2g}" if row["std"] is not None else "")
+    return text + (f" (thesis {row['reference']:.4g})" if row["reference"] is not None else "")
+
+
+if __name__ == "__main__":
+    write_whole(Path("docs/results.md"), render_page("docs/results"))

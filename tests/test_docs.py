@@ -1,0 +1,35 @@
+"""The documents do not lie: their code runs, and the results page is what the committed results say."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from swarmnet.results import render_page
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_the_guides_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/guide.md").read_text(), re.DOTALL)
+    assert len(blocks) >= 5
+    scope: dict = {}
+    for block in blocks:
+        exec(compile(block, "docs/guide.md", "exec"), scope)
+    assert "(64, 21, 5, 2)" in capsys.readouterr().out
+    assert (tmp_path / "scene.xml").exists()
+    assert scope["recording"].position.shape == (64, 21, 5, 2)
+
+
+def test_the_results_page_is_rendered_from_the_committed_results() -> None:
+    assert (ROOT / "docs/results.md").read_text() == render_page(ROOT / "docs/results")
+
+
+def test_commands_that_the_documents_name_exist() -> None:
+    from swarmnet.cli import _MODULES
+
+    known = {kind.__name__.lower() for kind in _MODULES}
+    for path in (ROOT / "README.md", ROOT / "docs/guide.md", ROOT / "docs/results.md"):
+        named = set(re.findall(r"(?<![\w/])swarmnet ([a-z]+)", path.read_text()))
+        assert named <= known | {"best", "thesis"}, path
