@@ -39,10 +39,14 @@ class Model:
 class Checkpoints:
     """The checkpoints of one run in `folder`, newest two kept. A save is complete or absent; leftovers are removed."""
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, *, read_only: bool = False) -> None:
         self.folder = Path(folder).absolute()
+        # Read-only leaves the unfinished save of a training that runs beside us alone.
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=2, cleanup_tmp_directories=True, enable_async_checkpointing=False
+            max_to_keep=None if read_only else 2,
+            cleanup_tmp_directories=not read_only,
+            read_only=read_only,
+            enable_async_checkpointing=False,
         )
         with _explained(self.folder, "opened"):
             self._manager = ocp.CheckpointManager(self.folder, options=options)
@@ -92,7 +96,7 @@ def load_model(folder: str | Path) -> Model:
     folder = Path(folder)
     if not folder.is_dir():
         raise CheckpointError(f"{folder}: no such checkpoint folder; `swarmnet train` makes one")
-    checkpoints = Checkpoints(folder)
+    checkpoints = Checkpoints(folder, read_only=True)
     step = checkpoints.latest()
     if step is None:
         raise CheckpointError(f"{folder}: holds no whole checkpoint")

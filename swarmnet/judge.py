@@ -10,17 +10,18 @@ import numpy as np
 from envs.collisions import Estimate, collision_report
 from envs.config import SimulateConfig, World
 from envs.experts.boids import Policy, boids
-from envs.plain import from_plain
+from envs.plain import from_plain, plain
 from envs.rollout import make_rollout
 from envs.storage import save
 from envs.swarm_env import SwarmEnv, scene_keys
-from envs.trajectories import Trajectories, concatenate, from_recording
+from envs.trajectories import Trajectories, concatenate, from_recording, versions
 from gnn.checkpoint import Model
 from gnn.decode import make_policy, make_predict
 from gnn.evaluate import PredictionError, constant_velocity, persistence, prediction_error
 from gnn.windows import Dataset, windows
 from swarm_mjcf.errors import SwarmError
 from swarmnet.progress import progress
+from swarmnet.results import commit, hardware
 
 CHUNK = 256
 """Scenes per batch in closed loop."""
@@ -36,13 +37,17 @@ class Judgement:
     contacts: bool
     """Whether bodies collide in this world."""
     dt: float
+    preset: str
+    engine: str
     scenes: int
     steps: int
     seed: int
 
     def plain(self) -> dict:
-        """Plain JSON values."""
+        """Plain JSON values, with what is needed to measure again."""
         return {
+            "preset": self.preset, "engine": self.engine, "hardware": hardware(), "versions": versions(),
+            "commit": commit(),
             "prediction": {
                 name: {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(error).items()}
                 for name, error in self.prediction.items()
@@ -75,7 +80,7 @@ def roll_out(
         for first in range(0, scenes, size):
             keys = scene_keys(seed, range(first, first + size))
             recording = jax.device_get(run(params, env.reset(keys), keys))
-            about = {"seed": seed, "engine": env.engine.name, "policy": title}
+            about = {"policy": title, "seed": seed, "engine": env.engine.name, "world": plain(world)}
             parts.append(from_recording(recording, world.scene, about))
             update(min(first + size, scenes), scenes)
     return concatenate(parts).take(slice(0, scenes))
@@ -99,6 +104,8 @@ def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str) -> J
     expert = roll_out(world, boids(world.boids), None, title="expert in physics", **shared)
     save(folder / "rollouts" / "expert.h5", expert)
     collisions = {}
+    for stale in ("learned.h5", "sweep_truth.h5", "sweep_predicted.h5"):  # of an earlier model that could steer
+        (folder / "rollouts" / stale).unlink(missing_ok=True)
     if model.config.output == "acceleration":
         policy = make_policy(model.config, model.scales, goal=world.scene.goal)
         learned = roll_out(world, policy, model.params, title=f"{name} in physics", **shared)
@@ -117,7 +124,15 @@ def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str) -> J
                 predict, params, expert, window=model.config.window, progress=lambda a, b, update=update: update(a, b)
             )
     return Judgement(
-        prediction, collisions, world.scene.contacts, world.scene.dt, config.scenes, config.steps, config.seed
+        prediction=prediction,
+        collisions=collisions,
+        contacts=world.scene.contacts,
+        dt=world.scene.dt,
+        preset=config.preset,
+        engine=expert.provenance["engine"],
+        scenes=config.scenes,
+        steps=config.steps,
+        seed=config.seed,
     )
 
 
@@ -141,7 +156,7 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
         obstacle_present=jnp.asarray(start.obstacle_present).at[:, 0].set(True),
     )
     recording = jax.device_get(make_rollout(env, boids(world.boids), steps=steps)(None, start, keys))
-    truth = from_recording(recording, world.scene, {"policy": "expert", "seed": seed})
+    truth = from_recording(recording, world.scene, {"policy": "expert", "seed": seed, "world": plain(world)})
     predict = make_predict(model.config, model.scales, model.integrator)
     first = model.config.window
     scene, zero = jnp.arange(4), jnp.zeros(4, jnp.int32)
@@ -150,7 +165,12 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
     )
     states = np.concatenate([history, predict(model.params, history, graph, horizon=future.shape[1])], axis=1)
     states = np.where(truth.mask[..., None], states, 0).astype(np.float32)
-    predicted = replace(truth, position=states[..., :2], velocity=states[..., 2:], provenance={"policy": "prediction"})
+    predicted = replace(
+        truth,
+        position=states[..., :2],
+        velocity=states[..., 2:],
+        provenance=truth.provenance | {"policy": "prediction"},
+    )
     save(folder / "rollouts" / "sweep_truth.h5", truth)
     save(folder / "rollouts" / "sweep_predicted.h5", predicted)
 

@@ -7,8 +7,13 @@ from envs.config import SimulateConfig
 from gnn.checkpoint import load_model
 from swarmnet.config import Evaluate
 from swarmnet.judge import Judgement, judge, tables, training_world
+from swarmnet.progress import progress
 from swarmnet.report import write_report
 from swarmnet.results import Results, Row, write_results, write_whole
+from swarmnet.videos import make_videos
+
+VIDEOS = 3
+"""Scenes to make videos of."""
 
 
 def run(config: Evaluate) -> int:
@@ -22,6 +27,8 @@ def run(config: Evaluate) -> int:
     print(tables(judgement))
     if config.json:
         write_results(config.json, as_results(judgement))
+    with progress("videos") as update:
+        make_videos(config.run, VIDEOS, progress=update)
     print(f"report: {write_report(config.run)}")
     return 0
 
