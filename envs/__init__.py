@@ -1,7 +1,6 @@
 """What happens in a scene? Engines, experts, contacts, environment, trajectories. Names are loaded on first use."""
 
-import importlib
-from typing import Any
+from swarm_mjcf.lazy import lazy
 
 _PUBLIC = {
     "BoidsConfig": "config",
@@ -23,14 +22,4 @@ _PUBLIC = {
     "scene_keys": "swarm_env",
     "stream": "storage",
 }
-__all__ = sorted(_PUBLIC)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(f"envs.{_PUBLIC[name]}"), name)
-    raise AttributeError(f"module 'envs' has no attribute {name!r}; it has {', '.join(__all__)}")
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy(__name__, _PUBLIC)

@@ -2,8 +2,10 @@
 
 import contextlib
 import hashlib
+import io
 import json
 import os
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,8 @@ FORMAT = "swarmnet-trajectories"
 VERSION = 1
 SLAB = 256
 """Scenes per HDF5 chunk and per checksum: what a streaming reader holds at least."""
+_SIGNATURE, _MARK = b"\x89HDF\r\n\x1a\n", b"SWARMCRC"
+"""How HDF5 files begin, and what precedes the checksum (CRC-32) of all bytes before it, at the end of ours."""
 _SCALARS = ("dt", "substeps", "max_speed", "max_acceleration")
 
 
@@ -34,6 +38,37 @@ class Header:
     max_speed: float
     max_acceleration: float
     provenance: dict
+
+
+def ending(file: io.RawIOBase | io.BufferedIOBase) -> bytes:
+    """What ends a file: the checksum of its bytes. HDF5 ignores what follows its data. Leaves the file at its end."""
+    mark = _MARK + _crc(file, file.seek(0, os.SEEK_END)).to_bytes(4, "little")
+    file.seek(0, os.SEEK_END)
+    return mark
+
+
+def _crc(file: io.RawIOBase | io.BufferedIOBase, size: int) -> int:
+    file.seek(0)
+    crc = 0
+    while size and (block := file.read(min(size, 1 << 22))):
+        crc, size = zlib.crc32(block, crc), size - len(block)
+    return crc
+
+
+def _check_bytes(path: str | Path) -> None:
+    """Raises TrajectoryError for a damaged file before HDF5 reads it: a flipped byte can make HDF5 loop for ever."""
+    with open(path, "rb") as file:
+        if file.read(len(_SIGNATURE)) != _SIGNATURE:
+            raise TrajectoryError(f"{path}: not a whole HDF5 file of trajectories (it begins otherwise)")
+        size = file.seek(0, os.SEEK_END) - len(_MARK) - 4
+        file.seek(max(size, 0))
+        last = file.read()
+        if not last.startswith(_MARK):
+            raise TrajectoryError(
+                f"{path}: an HDF5 file, but not of trajectories or not whole (no checksum at its end)"
+            )
+        if last[len(_MARK) :] != _crc(file, size).to_bytes(4, "little"):
+            raise TrajectoryError(f"{path}: corrupt, its bytes do not match their checksum")
 
 
 class _Disk:
@@ -64,8 +99,10 @@ class _Disk:
     def flush(self) -> None:
         """Nothing is buffered here."""
 
-    def sync(self) -> None:
+    def finish(self) -> None:
+        """Adds the checksum of all bytes, which HDF5 has written by now, and flushes to disk."""
         with self._noting():
+            self.write(ending(self._file))
             os.fsync(self._file.fileno())
 
     def check(self) -> None:
@@ -132,7 +169,7 @@ class TrajectoryWriter:
             attrs["digests"] = json.dumps(self._digests)
             attrs["seal"] = _seal(self._file)
             self._file.close()
-            self._disk.sync()
+            self._disk.finish()
             self._disk.check()
             self._disk.close()
             os.replace(self._partial, self.path)
@@ -192,22 +229,19 @@ def save(path: str | Path, trajectories: Trajectories) -> None:
 def read_header(path: str | Path) -> Header:
     """What a file holds. Raises TrajectoryError for a missing, foreign, truncated or altered file."""
     with _opened(path) as file:
-        scenes, rows, nodes = _array(file, "mask").shape
-        attrs = file.attrs
-        return Header(
-            path=Path(path),
-            scenes=scenes,
-            rows=rows,
-            nodes=nodes,
-            provenance=json.loads(str(attrs["provenance"])),
-            **_scalars(attrs),
-        )
+        return _header(path, file)
+
+
+def _header(path: str | Path, file: h5py.File) -> Header:
+    scenes, rows, nodes = _array(file, "mask").shape
+    provenance = json.loads(str(file.attrs["provenance"]))
+    return Header(path=Path(path), scenes=scenes, rows=rows, nodes=nodes, provenance=provenance, **_scalars(file.attrs))
 
 
 def stream(path: str | Path) -> Iterator[Trajectories]:
     """Slabs of at most `SLAB` scenes, each checked against its checksum."""
-    header = read_header(path)
     with _opened(path) as file:
+        header = _header(path, file)
         digests = json.loads(str(file.attrs["digests"]))
         for number, start in enumerate(range(0, header.scenes, SLAB)):
             slab = Trajectories(
@@ -262,6 +296,8 @@ def _seal(file: h5py.File) -> str:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[h5py.File]:
+    with _explained(path, "read"):
+        _check_bytes(path)
     with _explained(path, "read"), h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:
             raise TrajectoryError(f"{path}: an HDF5 file, but not of trajectories (no '{FORMAT}' header)")

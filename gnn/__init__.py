@@ -1,7 +1,6 @@
 """What is the law? Graph, SwarmNet, imitation, evaluation. Names are loaded on first use."""
 
-import importlib
-from typing import Any
+from swarm_mjcf.lazy import lazy
 
 _PUBLIC = {
     "Checkpoints": "checkpoint",
@@ -16,14 +15,4 @@ _PUBLIC = {
     "model_preset": "config",
     "prediction_error": "evaluate",
 }
-__all__ = sorted(_PUBLIC)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(f"gnn.{_PUBLIC[name]}"), name)
-    raise AttributeError(f"module 'gnn' has no attribute {name!r}; it has {', '.join(__all__)}")
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy(__name__, _PUBLIC)

@@ -17,6 +17,7 @@ from gnn.decode import Integrator, Params
 from gnn.features import Scales
 from swarm_mjcf.errors import SwarmError
 
+_LOG = logging.getLogger(__name__)
 logging.getLogger("absl").setLevel(logging.ERROR)  # orbax reports every save in a dozen lines
 
 
@@ -67,15 +68,41 @@ class Checkpoints:
 
     def about(self, step: int) -> dict:
         """The description saved with a checkpoint."""
-        with _explained(self.folder, "read"):
+        with _explained(self.folder / str(step), "read"):
             return self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
 
-    def restore(self, step: int, like: dict) -> dict:
-        """The state of a checkpoint, in the structure and dtypes of `like`."""
-        with _explained(self.folder, "read"):
-            template = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+    def restore(self, step: int, like: dict | None = None) -> dict:
+        """The state of a checkpoint, in the structure and dtypes of `like`, or as it was saved."""
+        with _explained(self.folder / str(step), "read"):
+            template = None if like is None else jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
             args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
             return self._manager.restore(step, args=args)["state"]
+
+    def newest(self, like: dict | None = None) -> tuple[int, dict, dict] | None:
+        """`(step, about, state)` of the newest checkpoint that can be read, None where there is none.
+
+        A damaged one is passed over with a warning in the log. Raises CheckpointError when all are damaged.
+        """
+        damaged: list[CheckpointError] = []
+        for step in sorted(self._manager.all_steps(), reverse=True):
+            try:
+                found = step, self.about(step), self.restore(step, like)
+            except CheckpointError as error:
+                damaged.append(error)
+                continue
+            for error in damaged:
+                _LOG.warning("%s; step %d is taken instead", error, step)
+            return found
+        if damaged:
+            raise damaged[0]
+        return None
+
+    def drop_after(self, step: int) -> None:
+        """Removes checkpoints newer than `step`: the damaged ones that `newest` passed over."""
+        with _explained(self.folder, "removed"):
+            for newer in self._manager.all_steps():
+                if newer > step:
+                    self._manager.delete(newer)
 
     def close(self) -> None:
         """Releases the folder."""
@@ -97,16 +124,15 @@ def load_model(folder: str | Path) -> Model:
     if not folder.is_dir():
         raise CheckpointError(f"{folder}: no such checkpoint folder; `swarmnet train` makes one")
     checkpoints = Checkpoints(folder, read_only=True)
-    step = checkpoints.latest()
-    if step is None:
+    found = checkpoints.newest()
+    checkpoints.close()
+    if found is None:
         raise CheckpointError(f"{folder}: holds no whole checkpoint")
-    about = checkpoints.about(step)
+    step, about, state = found
     with _explained(folder, "read"):
-        state = checkpoints._manager.restore(step, args=ocp.args.Composite(state=ocp.args.StandardRestore()))["state"]
         config = from_plain(ModelConfig, about["model"])
         scales = Scales(**{name: jnp.asarray(value, jnp.float32) for name, value in about["scales"].items()})
         integrator = from_plain(Integrator, about["integrator"])
-    checkpoints.close()
     return Model(config, scales, integrator, state["params"], about | {"step": step})
 
 

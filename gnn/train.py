@@ -23,6 +23,7 @@ from gnn.config import TrainConfig, model_preset
 from gnn.decode import Integrator, Predict, make_predict
 from gnn.evaluate import natural_change
 from gnn.features import Scales
+from gnn.graph import Graph
 from gnn.losses import multi_step_loss
 from gnn.metrics import Metrics
 from gnn.swarmnet import SwarmNet
@@ -72,15 +73,16 @@ def train(
     state = _initial(config, data, counts, scales, optimizer)
 
     checkpoints = Checkpoints(folder / "checkpoints")
-    latest = checkpoints.latest()
-    if latest is not None:
-        had = checkpoints.about(latest)
+    found = checkpoints.newest()
+    if found is not None:
+        step, had, state = found
         different = [key for key in about if had.get(key) != about[key]]
         if different:
             raise CheckpointError(
                 f"{folder}: holds a run with other settings ({', '.join(different)} differ); take another run name"
             )
-        state = checkpoints.restore(latest, state)
+        checkpoints.drop_after(step)
+        state = checkpoints.restore(step, like)
     done = int(state["step"])
     run_chunk = _make_chunk(config, predict, scales, optimizer, counts)
     measure = _make_validation(predict, validation or trajectories, preset.window, max(config.horizons))
@@ -125,8 +127,13 @@ def _initial(config: TrainConfig, data: Dataset, counts: tuple, scales: Scales, 
     preset = model_preset(config.model)
     zero = jnp.zeros(1, jnp.int32)
     history, _, _, graph = windows(data, zero, zero, window=preset.window, horizon=1, counts=counts)
-    params = SwarmNet(preset, scales).init(jax.random.key(config.seed), history, graph)["params"]
-    return {"params": params, "optimizer": optimizer.init(params), "step": jnp.zeros((), jnp.int32)}
+
+    @jax.jit  # otherwise every layer's draw compiles for itself
+    def initial(key: Key[Array, ""], history: Array, graph: Graph) -> dict:
+        params = SwarmNet(preset, scales).init(key, history, graph)["params"]
+        return {"params": params, "optimizer": optimizer.init(params), "step": jnp.zeros((), jnp.int32)}
+
+    return initial(jax.random.key(config.seed), history, graph)
 
 
 def _make_chunk(config: TrainConfig, predict: Predict, scales: Scales, optimizer, counts: tuple[int, int, int]):

@@ -1,9 +1,7 @@
 """What is a scene? Specification, MJCF, compiled model, addresses, pictures. Names are loaded on first use."""
 
-import importlib
-from typing import Any
-
 from swarm_mjcf import gl  # noqa: F401  (settles MUJOCO_GL before anything imports mujoco)
+from swarm_mjcf.lazy import lazy
 
 _PUBLIC = {
     "Playback": "playback",
@@ -18,14 +16,4 @@ _PUBLIC = {
     "to_xml": "build",
     "write_video": "video",
 }
-__all__ = sorted(_PUBLIC)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(f"swarm_mjcf.{_PUBLIC[name]}"), name)
-    raise AttributeError(f"module 'swarm_mjcf' has no attribute {name!r}; it has {', '.join(__all__)}")
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy(__name__, _PUBLIC)
