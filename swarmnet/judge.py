@@ -86,8 +86,10 @@ def roll_out(
     return concatenate(parts).take(slice(0, scenes))
 
 
-def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str) -> Judgement:
+def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str, label: str = "") -> Judgement:
     """Rolls out expert and model on the scenes of `config`, measures both, and records them in `folder`/rollouts.
+
+    `label` stands before the titles of the progress bars.
 
     Raises SwarmError when the scenes are those of the training data.
     """
@@ -101,14 +103,14 @@ def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str) -> J
             f"world has {world.scene.dt} s with {world.scene.substeps}"
         )
     shared = {"engine": config.engine, "scenes": config.scenes, "steps": config.steps, "seed": config.seed}
-    expert = roll_out(world, boids(world.boids), None, title="expert in physics", **shared)
+    expert = roll_out(world, boids(world.boids), None, title=f"{label}expert in physics", **shared)
     save(folder / "rollouts" / "expert.h5", expert)
     collisions = {}
     for stale in ("learned.h5", "sweep_truth.h5", "sweep_predicted.h5"):  # of an earlier model that could steer
         (folder / "rollouts" / stale).unlink(missing_ok=True)
     if model.config.output == "acceleration":
         policy = make_policy(model.config, model.scales, goal=world.scene.goal)
-        learned = roll_out(world, policy, model.params, title=f"{name} in physics", **shared)
+        learned = roll_out(world, policy, model.params, title=f"{label}{name} in physics", **shared)
         save(folder / "rollouts" / "learned.h5", learned)
         collisions = {"expert": collision_report(expert), name: collision_report(learned)}
         sweep(world, model, folder, engine=config.engine, steps=config.steps, seed=config.seed)
@@ -119,7 +121,7 @@ def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str) -> J
     }
     prediction = {}
     for row, (predict, params) in predictors.items():
-        with progress(f"prediction, {row}") as update:
+        with progress(f"{label}predict, {row}") as update:
             prediction[row] = prediction_error(
                 predict, params, expert, window=model.config.window, progress=lambda a, b, update=update: update(a, b)
             )

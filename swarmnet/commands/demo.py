@@ -35,12 +35,12 @@ def run(config: Demo) -> int:
     folder = Path("runs") / config.name
     _claim(folder, config)
     world = SimulateConfig(preset="clear", scenes=config.scenes, seed=config.seed, engine=config.engine)
-    with progress("1/5 simulate") as update:
+    with progress("1/4 simulate") as update:
         simulate(world, folder / "data.h5", progress=update)
     data = load(folder / "data.h5")
     kept = max(1, len(data) // 20)
     training = TrainConfig(model=config.model, seed=config.seed).scaled(config.scale)
-    with progress("2/5 train") as update:
+    with progress("2/4 train") as update:
         train(
             training,
             data.take(slice(kept, None)),
@@ -51,9 +51,11 @@ def run(config: Demo) -> int:
     judged = folder / "evaluation.json"
     if not judged.exists():
         unseen = replace(world, scenes=config.test_scenes, seed=config.seed + TEST_SEED)
-        judgement = judge(load_model(folder / "checkpoints"), unseen, folder, name=f"swarmnet {config.model}")
+        judgement = judge(
+            load_model(folder / "checkpoints"), unseen, folder, name=f"swarmnet {config.model}", label="3/4 "
+        )
         write_whole(judged, json.dumps(judgement.plain(), indent=1))
-    with progress("4/5 videos") as update:
+    with progress("4/4 videos") as update:
         make_videos(folder, config.videos, progress=update)
     report = write_report(folder)
     print(summary(json.loads(judged.read_text()), f"swarmnet {config.model}"))
