@@ -129,6 +129,7 @@ class TrajectoryWriter:
         self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}.partial")
         with _explained(self.path, "write"):
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            _remove_abandoned(self.path)
             self._disk = _Disk(self._partial)
             self._file = h5py.File(self._disk, "w", track_order=True)
         self._pending: Trajectories | None = None
@@ -266,6 +267,18 @@ def load(path: str | Path, *, scenes: int | None = None) -> Trajectories:
         raise TrajectoryError(f"{path}: {scenes} scenes were asked for, it holds {have}")
     whole = concatenate(parts)
     return whole if scenes is None else whole.take(slice(0, scenes))
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Removes what writers of this file left that were killed while they wrote."""
+    for partial in path.parent.glob(f".{path.name}.*.partial"):
+        writer = partial.name.split(".")[-2]
+        try:
+            os.kill(int(writer), 0)  # signal 0 only asks whether the process lives
+        except ProcessLookupError:
+            partial.unlink(missing_ok=True)
+        except (PermissionError, ValueError):
+            pass
 
 
 def _array(file: h5py.File, name: str) -> h5py.Dataset:

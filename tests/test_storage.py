@@ -349,3 +349,14 @@ except TrajectoryError as error:
     assert (result.returncode, result.stdout) == (0, "refused\n"), result.stderr[-3000:]
     assert_same_trajectories(load(path), SAMPLE)
     assert only_file(path)
+
+
+def test_what_a_killed_writer_left_is_removed_and_a_living_ones_is_not(tmp_path: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    abandoned, living = (tmp_path / f".a.h5.{pid}.partial" for pid in (dead.pid, os.getppid()))
+    abandoned.write_bytes(b"half")
+    living.write_bytes(b"half")
+    save(tmp_path / "a.h5", make_trajectories(scenes=2))
+    assert not abandoned.exists()
+    assert living.exists()
