@@ -36,6 +36,28 @@ class _Worker:
     records: dict = field(default_factory=dict)
 
 
+def _bodies_of(model: mujoco.MjModel, spec: SceneSpec) -> slice:
+    """Columns of a batch's state rows that hold qpos, qvel, qacc_warmstart and ctrl, one after the other."""
+
+    def start(component: mujoco.mjtState) -> int:
+        # A row has the components in the order of their bits.
+        before = int(mujoco.mjtState.mjSTATE_INTEGRATION) & (int(component) - 1)
+        return mujoco.mj_stateSize(model, before)
+
+    state, n = mujoco.mjtState, 2 * spec.num_agents
+    first = start(state.mjSTATE_QPOS)
+    order = (state.mjSTATE_QPOS, state.mjSTATE_QVEL, state.mjSTATE_WARMSTART, state.mjSTATE_CTRL)
+    if [start(part) for part in order] != [first, first + n, first + 2 * n, first + 3 * n]:
+        raise RuntimeError("this MuJoCo lays out the state of a batch in another order than 3.17 does")
+    return slice(first, first + 4 * n)
+
+
+def _unpacked(bodies: Array) -> dict[str, Array]:
+    """Fields of the state from (S, 4N)."""
+    halves = bodies.reshape(bodies.shape[0], 2, -1, 2)
+    return {"position": halves[:, 0], "velocity": halves[:, 1]}
+
+
 class NativeEngine:
     """See `envs.engines.engine.Engine`. `threads=0` takes every CPU.
 
@@ -51,18 +73,22 @@ class NativeEngine:
         self._threads = threads
         self._model = compile_scene(spec)
         self._index = SceneIndex.of(self._model, spec)
+        self._bodies = _bodies_of(self._model, spec)
         self._pool: dict[int, collections.deque[_Worker]] = collections.defaultdict(collections.deque)
 
     def step(self, state: State, acceleration: Float[Array, "S N 2"]) -> tuple[State, Contacts]:
         """One control step of `substeps` physics steps; contacts of states 1..k."""
         scenes, agents, _ = state.position.shape
         dtype = state.position.dtype
-        # Few, packed arrays cross the border: each costs as much as stepping a dozen scenes.
-        bodies = jnp.concatenate([state.position, state.velocity, acceleration.astype(dtype)], axis=-1)
-        moved = jax.ShapeDtypeStruct((scenes, agents, 4), dtype)
+        # Few arrays cross the border, the bodies as MuJoCo lays them out (qpos, qvel, warm start, ctrl): one copy in, one
+        # copy out.
+        still = jnp.zeros_like(state.position)
+        parts = (state.position, state.velocity, still, acceleration.astype(dtype))
+        bodies = jnp.concatenate([part.reshape(scenes, -1) for part in parts], axis=1)
+        moved = jax.ShapeDtypeStruct((scenes, 4 * agents), dtype)
         if not self.spec.contacts:
             out = jax.pure_callback(self._advance, moved, bodies, state.obstacle, vmap_method="sequential")
-            return replace(state, position=out[..., :2], velocity=out[..., 2:]), no_contacts(scenes, agents)
+            return replace(state, **_unpacked(out)), no_contacts(scenes, agents)
         flags = jnp.concatenate(
             [state.touching_agent[..., None], state.touching_wall[..., None], state.touching_obstacle], axis=-1
         )
@@ -77,8 +103,7 @@ class NativeEngine:
         )
         state = replace(
             state,
-            position=out[..., :2],
-            velocity=out[..., 2:],
+            **_unpacked(out),
             touching_agent=flags[..., 0],
             touching_wall=flags[..., 1],
             touching_obstacle=flags[..., 2:],
@@ -88,7 +113,7 @@ class NativeEngine:
 
     @contextlib.contextmanager
     def _loaded(self, bodies: np.ndarray, obstacle: np.ndarray) -> Iterator[_Worker]:
-        """A worker whose batch holds the given states and controls (S, N, 6); back in the pool afterwards."""
+        """A worker whose batch holds the given states and controls (S, 8N); back in the pool afterwards."""
         scenes = bodies.shape[0]
         pool, index = self._pool[scenes], self._index
         try:
@@ -97,19 +122,14 @@ class NativeEngine:
             worker = _Worker(Batch(self._model, scenes, self._threads))
             worker.batch.bind("sensordata")
         batch = worker.batch
-        batch.qpos[:, index.qpos] = bodies[..., 0:2].reshape(scenes, -1)
-        batch.qvel[:, index.dof] = bodies[..., 2:4].reshape(scenes, -1)
-        batch.ctrl[:, index.control] = bodies[..., 4:6].reshape(scenes, -1)
+        batch.state[:, self._bodies] = bodies
         batch.mocap_pos[:, index.obstacle_mocap, :2] = obstacle
-        batch.qacc_warmstart[:] = 0
         yield worker
         pool.append(worker)  # a worker of a call that raised is dropped
 
-    def _moved(self, batch: Batch, bodies: np.ndarray) -> Float[np.ndarray, "S N 4"]:
-        moved = np.empty((*bodies.shape[:2], 4), bodies.dtype)
-        moved[..., :2] = batch.qpos[:, self._index.qpos].reshape(*bodies.shape[:2], 2)
-        moved[..., 2:] = batch.qvel[:, self._index.dof].reshape(*bodies.shape[:2], 2)
-        return moved
+    def _moved(self, batch: Batch, bodies: np.ndarray) -> Float[np.ndarray, "S M"]:
+        """Positions and velocities of all agents, (S, 4N)."""
+        return batch.state[:, self._bodies.start : self._bodies.start + bodies.shape[1] // 2].astype(bodies.dtype)
 
     def _advance(self, bodies: Array, obstacle: Array) -> np.ndarray:
         bodies = np.asarray(bodies)
@@ -120,7 +140,7 @@ class NativeEngine:
     def _advance_with_contacts(self, bodies: Array, obstacle: Array, flags: Array) -> tuple[np.ndarray, ...]:
         bodies, obstacle, flags = np.asarray(bodies), np.asarray(obstacle), np.asarray(flags)
         k, index = self.spec.substeps, self._index
-        scenes, agents = bodies.shape[:2]
+        scenes, agents = len(bodies), self.spec.num_agents
         with self._loaded(bodies, obstacle) as worker:
             batch = worker.batch
             if k == 1:
@@ -157,7 +177,8 @@ class NativeEngine:
         spec = self.spec
         if spec.num_agents > _BROADPHASE_AGENTS:
             return np.ones(len(moved), bool)
-        x, y = np.ascontiguousarray(moved[..., :2].transpose(2, 1, 0))  # (N, S) each: whole rows at a time
+        columns = np.ascontiguousarray(moved[:, : 2 * spec.num_agents].T)  # whole rows of scenes at a time
+        x, y = columns[0::2], columns[1::2]  # (N, S) each
         near = np.zeros(len(moved), bool)
 
         def add(dx: np.ndarray, dy: np.ndarray, reach: float) -> None:
