@@ -18,7 +18,7 @@ from gnn.features import Scales
 from swarm_mjcf.errors import SwarmError
 
 _LOG = logging.getLogger(__name__)
-logging.getLogger("absl").setLevel(logging.ERROR)  # orbax reports every save in a dozen lines
+logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax reports every save, and traces what it raises anyway
 
 
 class CheckpointError(SwarmError):

@@ -84,6 +84,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         model_preset(self.model)
+        for field in ("batch", "chunk"):
+            if getattr(self, field) < 1:
+                raise SpecError(field, getattr(self, field), "at least 1")
         if len(self.horizons) != len(self.stage_steps) or not self.horizons:
             raise SpecError("stage_steps", self.stage_steps, f"one number per horizon of {self.horizons}")
         if min(self.horizons) < 1:
@@ -91,9 +94,6 @@ class TrainConfig:
         for steps in self.stage_steps:
             if steps < self.chunk or steps % self.chunk:
                 raise SpecError("stage_steps", self.stage_steps, f"multiples of chunk = {self.chunk}, at least one")
-        for field in ("batch", "chunk"):
-            if getattr(self, field) < 1:
-                raise SpecError(field, getattr(self, field), "at least 1")
         for field in ("learning_rate", "clip_norm", "checkpoint_seconds"):
             if not getattr(self, field) > 0:
                 raise SpecError(field, getattr(self, field), "above 0")

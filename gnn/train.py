@@ -54,6 +54,8 @@ def train(
     """
     folder, preset = Path(folder), model_preset(config.model)
     check_rows(trajectories, preset.window + max(config.horizons), f"a horizon of {max(config.horizons)} steps")
+    if validation is not None:
+        check_rows(validation, preset.window + max(config.horizons), f"a validation of {max(config.horizons)} steps")
     scales = Scales.of(trajectories) if preset.normalise else _loss_scales(trajectories)
     integrator = Integrator(
         trajectories.dt, trajectories.substeps, trajectories.max_speed, trajectories.max_acceleration
@@ -70,19 +72,21 @@ def train(
         optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps)),
     )
     data, counts = Dataset.of(trajectories), trajectories.counts
-    state = _initial(config, data, counts, scales, optimizer)
+    start = partial(_initial, config, data, counts, scales, optimizer)
 
     checkpoints = Checkpoints(folder / "checkpoints")
     found = checkpoints.newest()
-    if found is not None:
-        step, had, state = found
+    if found is None:
+        state = start()
+    else:
+        step, had, _ = found
         different = [key for key in about if had.get(key) != about[key]]
         if different:
             raise CheckpointError(
                 f"{folder}: holds a run with other settings ({', '.join(different)} differ); take another run name"
             )
         checkpoints.drop_after(step)
-        state = checkpoints.restore(step, like)
+        state = checkpoints.restore(step, jax.eval_shape(start))
     done = int(state["step"])
     run_chunk = _make_chunk(config, predict, scales, optimizer, counts)
     measure = _make_validation(predict, validation or trajectories, preset.window, max(config.horizons))

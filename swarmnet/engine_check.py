@@ -68,7 +68,8 @@ def judge_flags(state: State, contacts: Contacts, spec: SceneSpec, verdict: Verd
     flags = np.concatenate([np.asarray(state.touching_agent)[..., None], np.asarray(state.touching_obstacle)], axis=-1)
     counted = np.asarray(contacts.agent_states) > 0
     present = np.asarray(state.agent_present)[..., None]
-    wrong = ((flags != (distances < 0)) & ~borderline) | (flags[..., :1] != counted[..., None])
+    wrong = (flags != (distances < 0)) & ~borderline
+    wrong[..., 0] |= flags[..., 0] != counted
     verdict.flags += int(present.sum()) * flags.shape[-1]
     verdict.on += int(flags.sum())
     verdict.wrong += int((wrong & present).sum() + (flags & ~present).sum())

@@ -82,7 +82,7 @@ def summary(judgement: dict, name: str) -> str:
     expert, learned = judgement["collisions"]["expert"], judgement["collisions"][name]
     error = judgement["prediction"][name]
 
-    def interval(report: dict, figure: str, scale: float = 1) -> str:
+    def interval(report: dict, figure: str, scale: float = 1.0) -> str:
         value, low, high = (report[figure][key] * scale for key in ("value", "low", "high"))
         return f"{value:.3g} [{low:.3g}, {high:.3g}]"
 
@@ -97,8 +97,8 @@ def summary(judgement: dict, name: str) -> str:
             "(value [95% interval])",
             f"  final goal distance   expert {interval(expert, 'final_goal_distance')} m   learned "
             f"{interval(learned, 'final_goal_distance')} m   ratio {ratio:.3f}",
-            f"  steps with a contact  expert {interval(expert, 'contact_steps_any', 100)} %   learned "
-            f"{interval(learned, 'contact_steps_any', 100)} %",
+            f"  steps with a contact  expert {interval(expert, 'contact_steps_any', 100.0)} %   learned "
+            f"{interval(learned, 'contact_steps_any', 100.0)} %",
             f"  normalized prediction error (published metric)  {errors}",
         )
     )
