@@ -67,7 +67,7 @@ class TrainConfig:
     """Initial weights and data order."""
     horizons: tuple[int, ...] = (1, 2, 5, 10)
     """Predicted steps in each stage of the curriculum."""
-    stage_steps: tuple[int, ...] = (6000, 3000, 2000, 2000)
+    stage_steps: tuple[int, ...] = (5000, 2500, 1500, 1000)
     """Gradient steps in each stage."""
     batch: int = 128
     """Windows per gradient step."""

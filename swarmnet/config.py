@@ -118,7 +118,7 @@ class Demo:
     """Unseen scenes to judge by."""
     model: str = "best"
     """Preset of the model: thesis-ch5 or best."""
-    scale: float = 0.4
+    scale: float = 0.5
     """Factor on the training's number of gradient steps; 1 is the full curriculum."""
     seed: int = 0
     """Seed of data and weights."""
