@@ -133,7 +133,7 @@ def _initial(config: TrainConfig, data: Dataset, counts: tuple, scales: Scales, 
     history, _, _, graph = windows(data, zero, zero, window=preset.window, horizon=1, counts=counts)
 
     @jax.jit  # otherwise every layer's draw compiles for itself
-    def initial(key: Key[Array, ""], history: Array, graph: Graph) -> dict:
+    def initial(key: Key[jax.Array, ""], history: Array, graph: Graph) -> dict:
         params = SwarmNet(preset, scales).init(key, history, graph)["params"]
         return {"params": params, "optimizer": optimizer.init(params), "step": jnp.zeros((), jnp.int32)}
 

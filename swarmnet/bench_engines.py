@@ -126,7 +126,7 @@ def bench_engines(agents: tuple[int, ...], substeps: tuple[int, ...], *, repeats
             if count > (100 if on_cpu else 200):
                 yield f"mjx, {count} agents, {k} substeps: left out, it keeps all {count * (count + 1) // 2} pairs"
                 continue
-            few = min(scenes, max(16, 2048 * 25 // count**2)) if on_cpu else scenes
+            few = min(scenes, max(2, 2048 * 25 // count**2)) if on_cpu else scenes
             part = _start(spec, few)
             cases = {"bare": _bare(spec, part), "mjx": _loop(make_engine(spec, "mjx"), part, None)}
             yield from (rate for rate in _case(cases, (count, k, few, repeats)) if rate.case != "bare")

@@ -174,11 +174,11 @@ class Bench:
     """engines: numbers of agents, each with 1 obstacle."""
     substeps: tuple[int, ...] = (1, 15)
     """engines: physics steps per control step."""
-    repeats: int = 5
+    repeats: int = 3
     """engines: interleaved repetitions; medians are printed."""
     scenes: int = 2000
     """imitation: training scenes."""
-    scale: float = 1.0
+    scale: float = 0.8
     """imitation: factor on the number of gradient steps."""
     seed: int = 0
     """imitation: seed of data and weights."""

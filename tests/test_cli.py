@@ -103,6 +103,23 @@ def test_a_wrong_word_is_named_and_exits_with_2(arguments: tuple[str, ...], name
         (("train", "x.h5", "--model", "gat"), "one of thesis-ch3, thesis-ch5, best"),
         (("train", "x.h5", "--stage-steps", "5", "5", "5", "5"), "multiples of chunk"),
         (("train", "x.h5", "--chunk", "0"), "chunk: 0 was given"),
+    ],
+)
+def test_a_value_that_its_own_configuration_refuses_exits_with_2(arguments, named: str, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    captured = capsys.readouterr()
+    text = " ".join((captured.err + captured.out).replace("│", " ").split())
+    assert named in text
+    assert "Traceback" not in text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
         (("train", "x.h5", "--validation", "1.5"), "a share between 0 and 1"),
         (("train", "no/such.h5"), "no/such.h5: does not exist"),
         (("evaluate", "no/run"), "no/run/checkpoints: no such checkpoint folder"),

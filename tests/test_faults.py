@@ -60,7 +60,9 @@ sys.exit(main(sys.argv[2:]))
 def with_full_disk(size: int, *arguments: str) -> subprocess.CompletedProcess:
     """`swarmnet ARGUMENTS` in a process that may write no file longer than `size` bytes."""
     command = [sys.executable, "-c", SCRIPT, str(size), *arguments]
-    return subprocess.run(command, env=environment(), capture_output=True, text=True)
+    settings = environment()
+    del settings["JAX_COMPILATION_CACHE_DIR"]  # JAX warns of what it cannot cache
+    return subprocess.run(command, env=settings, capture_output=True, text=True)
 
 
 def one_line(found: subprocess.CompletedProcess) -> str:

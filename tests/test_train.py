@@ -172,8 +172,8 @@ def test_bad_settings_are_named():
 
 
 def test_scaling_a_curriculum_keeps_whole_chunks():
-    config = TrainConfig()
+    config = TrainConfig(horizons=(1, 5), stage_steps=(6000, 2000), chunk=100)
     assert config.scaled(1.0) == config
-    assert config.scaled(0.4).stage_steps == (2400, 1200, 800, 800)
-    assert config.scaled(1e-9).stage_steps == (100, 100, 100, 100)
-    assert config.scaled(0.4).steps == 5200
+    assert config.scaled(0.4).stage_steps == (2400, 800)
+    assert config.scaled(0.01).stage_steps == (100, 100)
+    assert config.scaled(0.4).steps == 3200
