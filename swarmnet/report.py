@@ -97,9 +97,9 @@ def _filled(values: dict[str, str]) -> str:
 def _gather(run: Path) -> Facts:
     about = counts = demo = None
     if (run / "checkpoints").is_dir():
-        checkpoints = Checkpoints(run / "checkpoints")
-        latest = checkpoints.latest()
-        about = None if latest is None else checkpoints.about(latest) | {"step": latest}
+        checkpoints = Checkpoints(run / "checkpoints", read_only=True)  # a training may be saving beside us
+        newest = checkpoints.newest()
+        about = None if newest is None else newest[1] | {"step": newest[0]}
         checkpoints.close()
     if (run / "rollouts" / "expert.h5").exists():
         counts = load(run / "rollouts" / "expert.h5", scenes=1).counts
