@@ -51,12 +51,14 @@ def cohesion(quantity: Vectors, present: Present) -> Vectors:
 
 def separation(position: Vectors, present: Present, config: BoidsConfig) -> Vectors:
     """Sum over others in range of (p_i - p_j) / d^2, d floored at 0.01 m; divided by the others if not summed."""
-    apart = position[:, :, None] - position[:, None]
-    distance = jnp.sqrt(jnp.sum(apart * apart, axis=-1))
+    # x and y as planes (S, N, N): a trailing axis of 2 would keep XLA from using vector instructions.
+    x, y = position[..., 0], position[..., 1]
+    dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
+    distance = jnp.sqrt(dx * dx + dy * dy)
     agents = position.shape[1]
     close = (distance < config.separation_range) & present[:, None] & ~jnp.eye(agents, dtype=bool)
     push = jnp.where(close, 1 / jnp.maximum(distance, 0.01) ** 2, 0)
-    total = jnp.sum(apart * push[..., None], axis=2)
+    total = jnp.stack([jnp.sum(dx * push, axis=2), jnp.sum(dy * push, axis=2)], axis=-1)
     if config.separation_summed:
         return total
     return total / jnp.maximum(present.sum(axis=1) - 1, 1)[:, None, None].astype(position.dtype)
