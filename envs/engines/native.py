@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from mujoco.batch import Batch
 
-from envs.dynamics import free_flight
 from envs.engines.engine import read_sensors
 from envs.record import Array
 from envs.state import Contacts, State, no_contacts
@@ -21,7 +20,7 @@ from swarm_mjcf.index import SceneIndex
 from swarm_mjcf.spec import SceneSpec
 
 _BROADPHASE_AGENTS = 32
-"""Up to this many agents, looking at all pairs is faster than MuJoCo's visit to every scene."""
+"""Up to this many agents, all pairs in NumPy are faster than MuJoCo's visit to every scene."""
 
 _SLACK = 0.01
 """Added to distances there [m]: far above what float32 rounds off in an arena."""
@@ -81,7 +80,7 @@ class NativeEngine:
         """One control step of `substeps` physics steps; contacts of states 1..k."""
         scenes, agents, _ = state.position.shape
         dtype = state.position.dtype
-        # Few arrays cross the border, the bodies as MuJoCo lays them out (qpos, qvel, warm start, ctrl): a copy in, a
+        # Few arrays cross the border, the bodies as MuJoCo lays them out (qpos, qvel, warm start, ctrl): one copy in, one
         # copy out.
         still = jnp.zeros_like(state.position)
         parts = (state.position, state.velocity, still, acceleration.astype(dtype))
@@ -99,9 +98,8 @@ class NativeEngine:
             jax.ShapeDtypeStruct((len(_COUNTS), scenes, agents), np.int32),
             jax.ShapeDtypeStruct((len(_DEPTHS), scenes, agents), np.float32),
         )
-        near = self._near(state, acceleration)
         out, flags, counts, depths = jax.pure_callback(
-            self._advance_with_contacts, shapes, bodies, state.obstacle, flags, near, vmap_method="sequential"
+            self._advance_with_contacts, shapes, bodies, state.obstacle, flags, vmap_method="sequential"
         )
         state = replace(
             state,
@@ -139,10 +137,8 @@ class NativeEngine:
             worker.batch.step(nstep=self.spec.substeps)
             return self._moved(worker.batch, bodies)
 
-    def _advance_with_contacts(
-        self, bodies: Array, obstacle: Array, flags: Array, near: Array
-    ) -> tuple[np.ndarray, ...]:
-        bodies, obstacle, flags, near = (np.asarray(x) for x in (bodies, obstacle, flags, near))
+    def _advance_with_contacts(self, bodies: Array, obstacle: Array, flags: Array) -> tuple[np.ndarray, ...]:
+        bodies, obstacle, flags = np.asarray(bodies), np.asarray(obstacle), np.asarray(flags)
         k, index = self.spec.substeps, self._index
         scenes, agents = len(bodies), self.spec.num_agents
         with self._loaded(bodies, obstacle) as worker:
@@ -150,21 +146,24 @@ class NativeEngine:
             if k == 1:
                 batch.step()
                 recorded, positions = batch.sensordata[:, None][:, :0], batch.qpos[:, None]
+                touched = np.zeros(scenes, bool)
             else:
                 worker.records = batch.rollout(k, record=("sensordata", "qpos"), out=worker.records)
                 # A sensor record describes the state before its substep: records 1.. are states 1..k-1.
                 recorded, positions = worker.records["sensordata"][:, 1:], worker.records["qpos"]
-                near = near | recorded[..., index.touch].any(axis=(1, 2))
+                touched = recorded[..., index.touch].any(axis=(1, 2))
             moved = self._moved(batch, bodies)
+            near = self._near(moved, obstacle)
             batch.forward(ids=np.flatnonzero(near), stage=mujoco.mjtStage.mjSTAGE_VEL.value)  # state k
 
             # Scenes where nothing touches, most of them, are done: zeros.
             now = np.zeros_like(flags)
             counts = np.zeros((len(_COUNTS), scenes, agents), np.int32)
             depths = np.zeros((len(_DEPTHS), scenes, agents), np.float32)
-            rows = np.flatnonzero(near)
+            rows = np.flatnonzero(touched | near)
             if len(rows):
-                sensors = np.concatenate([recorded[rows], batch.sensordata[rows, None]], axis=1)
+                last = np.where(near[rows, None, None], batch.sensordata[rows, None], 0)
+                sensors = np.concatenate([recorded[rows], last], axis=1)
                 before = (flags[rows, :, 0], flags[rows, :, 2:], flags[rows, :, 1])
                 (agent, solid, wall), on_agent, fields = read_sensors(np, sensors, before, index, self.spec)
                 fields["agent_depth"] = self._agent_depth(on_agent, positions[rows])
@@ -173,28 +172,25 @@ class NativeEngine:
                 depths[:, rows] = [fields[name] for name in _DEPTHS]
         return moved, now, counts, depths
 
-    def _near(self, state: State, acceleration: Float[Array, "S N 2"]) -> Bool[Array, " S"]:
-        """Whether bodies may touch at state k, if none did at states 1..k-1; elsewhere its sensors are zero for sure.
-
-        Where nothing touches at states 0..k-1, state k is free flight in closed form; where something is near touching
-        at state 0 already, forces may act. The rest needs no second look by MuJoCo.
-        """
+    def _near(self, moved: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
+        """(S,) whether two bodies may touch; where not, all sensors of this state are zero for sure."""
         spec = self.spec
         if spec.num_agents > _BROADPHASE_AGENTS:
-            return jnp.ones(state.position.shape[0], bool)
-        later, _ = free_flight(state.position, state.velocity, acceleration, spec)
-        others = ~np.eye(spec.num_agents, dtype=bool)
-        near = jnp.zeros(state.position.shape[0], bool)
-        for position in (state.position, later):
-            x, y = position[..., 0], position[..., 1]
-            dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
-            near |= ((dx * dx + dy * dy < (2 * spec.agent_radius + _SLACK) ** 2) & others).any(axis=(1, 2))
-            dx, dy = x[:, :, None] - state.obstacle[:, None, :, 0], y[:, :, None] - state.obstacle[:, None, :, 1]
-            reach = spec.agent_radius + spec.obstacle_radius + _SLACK
-            near |= (dx * dx + dy * dy < reach**2).any(axis=(1, 2))
-            if spec.walls:
-                border = spec.arena - spec.agent_radius - _SLACK
-                near |= ((jnp.abs(position) > border) & state.agent_present[..., None]).any(axis=(1, 2))
+            return np.ones(len(moved), bool)
+        columns = np.ascontiguousarray(moved[:, : 2 * spec.num_agents].T)  # whole rows of scenes at a time
+        x, y = columns[0::2], columns[1::2]  # (N, S) each
+        near = np.zeros(len(moved), bool)
+
+        def add(dx: np.ndarray, dy: np.ndarray, reach: float) -> None:
+            np.logical_or(near, (dx * dx + dy * dy < np.float32(reach + _SLACK) ** 2).any(axis=0), out=near)
+
+        for shift in range(1, spec.num_agents):
+            add(x[shift:] - x[:-shift], y[shift:] - y[:-shift], 2 * spec.agent_radius)
+        for k in range(spec.num_obstacles):
+            add(x - obstacle[:, k, 0], y - obstacle[:, k, 1], spec.agent_radius + spec.obstacle_radius)
+        if spec.walls:
+            border = spec.arena - spec.agent_radius - _SLACK
+            near |= (np.maximum(np.abs(x), np.abs(y)) > border).any(axis=0)
         return near
 
     def _agent_depth(self, on_agent: np.ndarray, recorded: np.ndarray) -> np.ndarray:
