@@ -80,8 +80,8 @@ class NativeEngine:
         """One control step of `substeps` physics steps; contacts of states 1..k."""
         scenes, agents, _ = state.position.shape
         dtype = state.position.dtype
-        # Few arrays cross the border, the bodies as MuJoCo lays them out (qpos, qvel, warm start, ctrl): one copy in, one
-        # copy out.
+        # Few arrays cross the border, the bodies as MuJoCo lays them out (qpos, qvel, warm start, ctrl): one copy in,
+        # one copy out.
         still = jnp.zeros_like(state.position)
         parts = (state.position, state.velocity, still, acceleration.astype(dtype))
         bodies = jnp.concatenate([part.reshape(scenes, -1) for part in parts], axis=1)
