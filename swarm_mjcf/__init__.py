@@ -10,6 +10,7 @@ _PUBLIC = {
     "SpecError": "errors",
     "SwarmError": "errors",
     "check_gl": "render",
+    "compile_physics": "build",
     "compile_scene": "build",
     "frames": "render",
     "side_by_side": "render",

@@ -1,5 +1,6 @@
 """The built scene: plain MJCF that every MuJoCo loader takes, no solid meets a solid, addresses are found by name."""
 
+import dataclasses
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarm_mjcf import names
-from swarm_mjcf.build import build, compile_scene, to_xml
+from swarm_mjcf.build import build, compile_physics, compile_scene, to_xml
 from swarm_mjcf.index import SceneIndex
 from swarm_mjcf.spec import SceneSpec
 
@@ -270,3 +271,28 @@ def test_only_names_py_spells_element_names():
     ]
     spelling = {str(path.relative_to(root)): spelled_in(path.read_text()) for path in sources}
     assert {path for path, found in spelling.items() if found} == {"swarm_mjcf/names.py"}
+
+
+@pytest.mark.parametrize("walls", [False, True])
+def test_the_model_for_stepping_alone_has_the_same_physics_and_addresses(walls):
+    spec = SceneSpec(num_agents=6, num_obstacles=2, walls=walls, arena=30.0, obstacle_radius=3.0)
+    full, lean = compile_scene(spec), compile_physics(spec)
+    assert lean.ngeom < full.ngeom
+    assert lean.ncam == lean.nlight == 0
+    for field in dataclasses.fields(SceneIndex):
+        np.testing.assert_array_equal(
+            np.r_[getattr(SceneIndex.of(full, spec), field.name)], np.r_[getattr(SceneIndex.of(lean, spec), field.name)]
+        )
+    data, index = [mujoco.MjData(model) for model in (full, lean)], SceneIndex.of(full, spec)
+    rng = np.random.default_rng(0)
+    start, speed, pull = rng.uniform(-8, 8, 12), rng.uniform(-10, 10, 12), rng.uniform(-5, 5, 12)
+    touched = 0
+    for d, model in zip(data, (full, lean), strict=True):
+        d.qpos[index.qpos], d.qvel[index.dof], d.ctrl[index.control] = start, speed, pull
+        d.mocap_pos[index.obstacle_mocap, :2] = [[5, 5], [-5, -5]]
+        for _ in range(200):
+            mujoco.mj_step(model, d)
+            touched += d.ncon
+    assert touched > 100
+    for field in ("qpos", "qvel", "qacc", "sensordata"):
+        np.testing.assert_array_equal(getattr(data[0], field), getattr(data[1], field))

@@ -9,18 +9,19 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from mujoco.batch import Batch
 
+from envs.dynamics import free_flight
 from envs.engines.engine import read_sensors
 from envs.record import Array
 from envs.state import Contacts, State, no_contacts
-from swarm_mjcf.build import compile_scene
+from swarm_mjcf.build import compile_physics
 from swarm_mjcf.index import SceneIndex
 from swarm_mjcf.spec import SceneSpec
 
 _BROADPHASE_AGENTS = 32
-"""Up to this many agents, all pairs in NumPy are faster than MuJoCo's visit to every scene."""
+"""Up to this many agents, looking at all pairs is faster than MuJoCo's second visit to every scene."""
 
 _SLACK = 0.01
 """Added to distances there [m]: far above what float32 rounds off in an arena."""
@@ -30,9 +31,10 @@ _DEPTHS = ("agent_depth", "obstacle_depth", "wall_depth")
 
 @dataclass
 class _Worker:
-    """A batch and its recording buffers: what one call holds while it runs."""
+    """Two batches of the same scenes, one that moves and one that looks, and recording buffers: what a call holds."""
 
     batch: Batch
+    look: Batch
     records: dict = field(default_factory=dict)
 
 
@@ -71,7 +73,11 @@ class NativeEngine:
     def __init__(self, spec: SceneSpec, *, threads: int = 0) -> None:
         self.spec = spec
         self._threads = threads
-        self._model = compile_scene(spec)
+        self._model = compile_physics(spec)
+        # A single substep needs no sensors on the way: those before it belong to the control step before.
+        self._mover = compile_physics(spec)
+        if spec.substeps == 1:
+            self._mover.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._index = SceneIndex.of(self._model, spec)
         self._bodies = _bodies_of(self._model, spec)
         self._pool: dict[int, collections.deque[_Worker]] = collections.defaultdict(collections.deque)
@@ -98,8 +104,9 @@ class NativeEngine:
             jax.ShapeDtypeStruct((len(_COUNTS), scenes, agents), np.int32),
             jax.ShapeDtypeStruct((len(_DEPTHS), scenes, agents), np.float32),
         )
+        arguments = (bodies, state.obstacle, flags, self._near(state, acceleration))
         out, flags, counts, depths = jax.pure_callback(
-            self._advance_with_contacts, shapes, bodies, state.obstacle, flags, vmap_method="sequential"
+            self._advance_with_contacts, shapes, *arguments, vmap_method="sequential"
         )
         state = replace(
             state,
@@ -119,8 +126,9 @@ class NativeEngine:
         try:
             worker = pool.popleft()  # atomic: a deque is safe between threads
         except IndexError:
-            worker = _Worker(Batch(self._model, scenes, self._threads))
-            worker.batch.bind("sensordata")
+            worker = _Worker(*(Batch(model, scenes, self._threads) for model in (self._mover, self._model)))
+            worker.batch.bind("ncon")
+            worker.look.bind("sensordata")
         batch = worker.batch
         batch.state[:, self._bodies] = bodies
         batch.mocap_pos[:, index.obstacle_mocap, :2] = obstacle
@@ -137,24 +145,22 @@ class NativeEngine:
             worker.batch.step(nstep=self.spec.substeps)
             return self._moved(worker.batch, bodies)
 
-    def _advance_with_contacts(self, bodies: Array, obstacle: Array, flags: Array) -> tuple[np.ndarray, ...]:
-        bodies, obstacle, flags = np.asarray(bodies), np.asarray(obstacle), np.asarray(flags)
+    def _advance_with_contacts(self, bodies: Array, obstacle: Array, flags: Array, near: Array) -> tuple:
+        bodies, obstacle, flags, near = (np.asarray(x) for x in (bodies, obstacle, flags, near))
         k, index = self.spec.substeps, self._index
         scenes, agents = len(bodies), self.spec.num_agents
         with self._loaded(bodies, obstacle) as worker:
-            batch = worker.batch
+            batch, look = worker.batch, worker.look
             if k == 1:
                 batch.step()
-                recorded, positions = batch.sensordata[:, None][:, :0], batch.qpos[:, None]
-                touched = np.zeros(scenes, bool)
+                touched, positions = worker.batch.ncon > 0, batch.qpos[:, None]
+                recorded = np.empty((scenes, 0, look.sensordata.shape[1]))
             else:
-                worker.records = batch.rollout(k, record=("sensordata", "qpos"), out=worker.records)
-                # A sensor record describes the state before its substep: records 1.. are states 1..k-1.
+                worker.records = batch.rollout(k, record=("sensordata", "qpos", "ncon"), out=worker.records)
+                # A record describes the state before its substep: sensors 1.. are those of states 1..k-1.
                 recorded, positions = worker.records["sensordata"][:, 1:], worker.records["qpos"]
-                touched = recorded[..., index.touch].any(axis=(1, 2))
+                touched = worker.records["ncon"].reshape(scenes, k).any(axis=1)
             moved = self._moved(batch, bodies)
-            near = self._near(moved, obstacle)
-            batch.forward(ids=np.flatnonzero(near), stage=mujoco.mjtStage.mjSTAGE_VEL.value)  # state k
 
             # Scenes where nothing touches, most of them, are done: zeros.
             now = np.zeros_like(flags)
@@ -162,45 +168,46 @@ class NativeEngine:
             depths = np.zeros((len(_DEPTHS), scenes, agents), np.float32)
             rows = np.flatnonzero(touched | near)
             if len(rows):
-                last = np.where(near[rows, None, None], batch.sensordata[rows, None], 0)
-                sensors = np.concatenate([recorded[rows], last], axis=1)
+                look.state[rows] = batch.state[rows]
+                look.forward(ids=rows, stage=mujoco.mjtStage.mjSTAGE_VEL.value)  # state k
+                sensors = np.concatenate([recorded[rows], look.sensordata[rows, None]], axis=1)
                 before = (flags[rows, :, 0], flags[rows, :, 2:], flags[rows, :, 1])
                 (agent, solid, wall), on_agent, fields = read_sensors(np, sensors, before, index, self.spec)
-                fields["agent_depth"] = self._agent_depth(on_agent, positions[rows])
                 now[rows] = np.concatenate([agent[..., None], wall[..., None], solid], axis=-1)
                 counts[:, rows] = [fields[name] for name in _COUNTS]
+                fields["agent_depth"] = self._agent_depth(on_agent, positions, rows)
                 depths[:, rows] = [fields[name] for name in _DEPTHS]
         return moved, now, counts, depths
 
-    def _near(self, moved: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
-        """(S,) whether two bodies may touch; where not, all sensors of this state are zero for sure."""
+    def _near(self, state: State, acceleration: Float[Array, "S N 2"]) -> Bool[Array, " S"]:
+        """Whether two bodies may touch at state k if none does before; where not, all its sensors are zero for sure."""
         spec = self.spec
         if spec.num_agents > _BROADPHASE_AGENTS:
-            return np.ones(len(moved), bool)
-        columns = np.ascontiguousarray(moved[:, : 2 * spec.num_agents].T)  # whole rows of scenes at a time
-        x, y = columns[0::2], columns[1::2]  # (N, S) each
-        near = np.zeros(len(moved), bool)
+            return jnp.ones(len(state.position), bool)
+        # Scenes on the last axis: many to a vector.
+        agents = free_flight(state.position, state.velocity, acceleration, spec)[0].transpose(2, 1, 0)
+        obstacles = state.obstacle.transpose(2, 1, 0)
 
-        def add(dx: np.ndarray, dy: np.ndarray, reach: float) -> None:
-            np.logical_or(near, (dx * dx + dy * dy < np.float32(reach + _SLACK) ** 2).any(axis=0), out=near)
+        def within(one: Array, other: Array, reach: float) -> Array:
+            square = ((one[:, :, None] - other[:, None]) ** 2).sum(axis=0)
+            if one is other:
+                square = jnp.where(jnp.eye(spec.num_agents, dtype=bool)[..., None], jnp.inf, square)
+            return square.min(axis=(0, 1), initial=jnp.inf) < (reach + _SLACK) ** 2
 
-        for shift in range(1, spec.num_agents):
-            add(x[shift:] - x[:-shift], y[shift:] - y[:-shift], 2 * spec.agent_radius)
-        for k in range(spec.num_obstacles):
-            add(x - obstacle[:, k, 0], y - obstacle[:, k, 1], spec.agent_radius + spec.obstacle_radius)
+        near = within(agents, agents, 2 * spec.agent_radius)
+        near |= within(agents, obstacles, spec.agent_radius + spec.obstacle_radius)
         if spec.walls:
-            border = spec.arena - spec.agent_radius - _SLACK
-            near |= (np.maximum(np.abs(x), np.abs(y)) > border).any(axis=0)
+            near |= (jnp.abs(agents) > spec.arena - spec.agent_radius - _SLACK).any(axis=(0, 1))
         return near
 
-    def _agent_depth(self, on_agent: np.ndarray, recorded: np.ndarray) -> np.ndarray:
-        """Deepest agent-agent penetration [m], (S, N), from sphere geometry at the flagged states (S, k, nq) alone."""
+    def _agent_depth(self, on_agent: np.ndarray, recorded: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Deepest agent-agent penetration [m] of scenes `rows`, from sphere geometry at their flagged states alone."""
         scenes, _, agents = on_agent.shape
         depth = np.zeros((scenes, agents), np.float32)
         scene, substep, agent = np.nonzero(on_agent)
         if not len(scene):
             return depth
-        positions = recorded[scene, substep][:, self._index.qpos].reshape(-1, agents, 2)
+        positions = recorded[rows[scene], substep][:, self._index.qpos].reshape(-1, agents, 2)
         row = np.arange(len(agent))
         apart = positions - positions[row, agent][:, None]
         distance = np.hypot(apart[..., 0], apart[..., 1])
