@@ -3,7 +3,7 @@
 from swarm_mjcf.lazy import lazy
 
 _PUBLIC = {
-    "BoidsConfig": "config",
+    "BoidsConfig": "experts.config",
     "Contacts": "state",
     "SimulateConfig": "config",
     "SpawnConfig": "config",
@@ -12,6 +12,7 @@ _PUBLIC = {
     "Trajectories": "trajectories",
     "TrajectoryError": "trajectories",
     "boids": "experts.boids",
+    "make_expert": "experts",
     "collision_report": "collisions",
     "load": "storage",
     "make_engine": "engines",

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Key
 
-from envs.experts.boids import Policy
+from envs.policy import Policy
 from envs.record import Array, record
 from envs.state import Contacts, State
 from envs.swarm_env import SwarmEnv

@@ -11,7 +11,7 @@ import jax
 
 from envs.config import SimulateConfig
 from envs.engines import make_engine
-from envs.experts.boids import boids
+from envs.experts.registry import make_expert
 from envs.plain import plain
 from envs.rollout import make_rollout
 from envs.storage import Header, TrajectoryWriter, read_header, save, stream
@@ -33,7 +33,7 @@ def simulate_chunks(config: SimulateConfig, skip: frozenset[int] = frozenset()):
     world = config.world()
     engine = make_engine(world.scene, config.engine, threads=config.threads)
     env = SwarmEnv(world.scene, engine=engine, spawn=world.spawn, horizon=config.steps)
-    run = make_rollout(env, boids(world.boids), steps=config.steps)
+    run = make_rollout(env, make_expert(world.expert), steps=config.steps)
     size = min(config.chunk, config.scenes)
     about = provenance(config, env.engine.name)
     for number, first in enumerate(range(0, config.scenes, size)):

@@ -21,6 +21,10 @@ class State:
     """Goal [m]; zeros in a scene without one."""
     obstacle: Float[Array, "S K 2"]
     """Obstacles' positions [m]."""
+    obstacle_velocity: Float[Array, "S K 2"]
+    """Obstacles' constant velocities [m/s]; moved only in a scene with `SceneSpec.moving_obstacles`."""
+    target: Int[Array, "S N M"]
+    """Agents that each agent chases, -1 for none; M = 0 unless the expert is a chaser."""
     agent_present: Bool[Array, "S N"]
     obstacle_present: Bool[Array, "S K"]
     touching_agent: Bool[Array, "S N"]
@@ -74,6 +78,7 @@ def park(state: State, spec: SceneSpec) -> State:
         state,
         position=jnp.where(here, state.position, agents),
         velocity=jnp.where(here, state.velocity, 0),
+        obstacle_velocity=jnp.where(state.obstacle_present[..., None], state.obstacle_velocity, 0),
         obstacle=jnp.where(state.obstacle_present[..., None], state.obstacle, obstacles),
     )
 
@@ -86,6 +91,8 @@ def make_state(
     obstacle: Float[Array, "S K 2"],
     agent_present: Bool[Array, "S N"] | None = None,
     obstacle_present: Bool[Array, "S K"] | None = None,
+    obstacle_velocity: Float[Array, "S K 2"] | None = None,
+    target: Int[Array, "S N M"] | None = None,
 ) -> State:
     """A state at step 0 that touches nothing; all bodies are present unless masks say otherwise. Positions [m]."""
     scenes, agents, _ = position.shape
@@ -95,6 +102,8 @@ def make_state(
         velocity=velocity,
         goal=goal,
         obstacle=obstacle,
+        obstacle_velocity=jnp.zeros_like(obstacle) if obstacle_velocity is None else obstacle_velocity,
+        target=jnp.zeros((scenes, agents, 0), jnp.int32) if target is None else target,
         agent_present=jnp.ones((scenes, agents), bool) if agent_present is None else agent_present,
         obstacle_present=jnp.ones((scenes, obstacles), bool) if obstacle_present is None else obstacle_present,
         touching_agent=jnp.zeros((scenes, agents), bool),

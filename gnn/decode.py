@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from envs.dynamics import free_flight, limited
-from envs.experts.boids import Policy
+from envs.policy import Policy
 from envs.record import Array
 from envs.state import State
 from gnn.config import ModelConfig

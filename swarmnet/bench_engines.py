@@ -108,7 +108,7 @@ def bench_engines(agents: tuple[int, ...], substeps: tuple[int, ...], *, repeats
             scenes = int(np.clip(20480 // count, 16, 2048))
             start = _start(spec, scenes)
             native = make_engine(spec, "native")
-            expert = boids(replace(clear().boids, arena=spec.arena))
+            expert = boids(replace(clear().expert, arena=spec.arena))
             yield from _case(
                 {
                     "bare": _bare(spec, start),

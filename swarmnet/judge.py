@@ -9,8 +9,9 @@ import numpy as np
 
 from envs.collisions import Estimate, collision_report
 from envs.config import SimulateConfig, World
-from envs.experts.boids import Policy, boids
+from envs.experts.registry import make_expert
 from envs.plain import from_plain, plain
+from envs.policy import Policy
 from envs.rollout import make_rollout
 from envs.storage import save
 from envs.swarm_env import SwarmEnv, scene_keys
@@ -103,7 +104,7 @@ def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str, labe
             f"world has {world.scene.dt} s with {world.scene.substeps}"
         )
     shared = {"engine": config.engine, "scenes": config.scenes, "steps": config.steps, "seed": config.seed}
-    expert = roll_out(world, boids(world.boids), None, title=f"{label}expert in physics", **shared)
+    expert = roll_out(world, make_expert(world.expert), None, title=f"{label}expert in physics", **shared)
     save(folder / "rollouts" / "expert.h5", expert)
     collisions = {}
     for stale in ("learned.h5", "sweep_truth.h5", "sweep_predicted.h5"):  # of an earlier model that could steer
@@ -157,7 +158,7 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
         obstacle=jnp.asarray(start.obstacle).at[:, 0].set(places),
         obstacle_present=jnp.asarray(start.obstacle_present).at[:, 0].set(True),
     )
-    recording = jax.device_get(make_rollout(env, boids(world.boids), steps=steps)(None, start, keys))
+    recording = jax.device_get(make_rollout(env, make_expert(world.expert), steps=steps)(None, start, keys))
     truth = from_recording(recording, world.scene, {"policy": "expert", "seed": seed, "world": plain(world)})
     predict = make_predict(model.config, model.scales, model.integrator)
     first = model.config.window

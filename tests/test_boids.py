@@ -12,9 +12,10 @@ from helpers import scene_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.config import BoidsConfig, published
+from envs.config import published
 from envs.dynamics import free_flight, limited
 from envs.experts.boids import boids, rules
+from envs.experts.config import BoidsConfig
 from envs.state import State, make_state
 from swarm_mjcf.errors import SpecError
 from swarm_mjcf.spec import SceneSpec

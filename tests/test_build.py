@@ -293,6 +293,6 @@ def test_the_model_for_stepping_alone_has_the_same_physics_and_addresses(walls):
         for _ in range(200):
             mujoco.mj_step(model, d)
             touched += d.ncon
-    assert touched > 100
+    assert touched > 20
     for field in ("qpos", "qvel", "qacc", "sensordata"):
         np.testing.assert_array_equal(getattr(data[0], field), getattr(data[1], field))

@@ -8,7 +8,7 @@ from helpers import scene_state
 
 from envs.config import make_world
 from envs.engines import make_engine
-from envs.experts.boids import boids
+from envs.experts.registry import make_expert
 from envs.rollout import make_rollout
 from envs.swarm_env import SwarmEnv, scene_keys
 from swarm_mjcf.spec import SceneSpec
@@ -68,7 +68,7 @@ def contact_share(preset: str, *, scenes: int, **changes: object) -> float:
     world = make_world(preset)
     env = SwarmEnv(replace(world.scene, **changes), engine="native", spawn=world.spawn, horizon=60)
     keys = scene_keys(1, range(scenes))
-    run = make_rollout(env, boids(world.boids), steps=60)
+    run = make_rollout(env, make_expert(world.expert), steps=60)
     contacts = jax.device_get(run(None, env.reset(keys), keys)).contacts
     return float((contacts.agent_states + contacts.obstacle_states).any(axis=2).mean())
 

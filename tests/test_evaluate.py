@@ -12,7 +12,7 @@ from learning import blank, published, quick_compiles
 
 from envs.config import published as published_world
 from envs.dynamics import free_flight, limited
-from envs.experts.boids import boids
+from envs.experts.registry import make_expert
 from envs.state import make_state
 from envs.trajectories import AGENT, GOAL, OBSTACLE, Trajectories, TrajectoryError
 from gnn.evaluate import constant_velocity, natural_change, persistence, prediction_error
@@ -137,7 +137,7 @@ def test_constant_velocity_makes_no_error_where_velocities_are_constant():
 def test_the_true_law_makes_no_error_at_40_steps():
     """The expert and free flight in the place of a network: what is left is rounding, in a world with bends."""
     data, world = published(), published_world(num_agents=3)
-    expert = boids(world.boids)
+    expert = make_expert(world.expert)
 
     def law(params, history, graph, *, horizon):
         last = history[:, -1]

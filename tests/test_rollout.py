@@ -9,7 +9,7 @@ import pytest
 from helpers import assert_same, scenes_of
 
 from envs.config import clear
-from envs.experts.boids import boids
+from envs.experts.registry import make_expert
 from envs.rollout import make_rollout
 from envs.swarm_env import SwarmEnv, scene_keys
 
@@ -28,7 +28,7 @@ def noisy(state, params, keys):
 
 
 def test_a_rollout_records_what_stepping_gives(env: SwarmEnv):
-    policy = boids(WORLD.boids)
+    policy = make_expert(WORLD.expert)
     keys = scene_keys(0, range(6))
     start = env.reset(keys)
     recording = jax.device_get(make_rollout(env, policy, steps=4)(None, start, keys))

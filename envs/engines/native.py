@@ -126,7 +126,8 @@ class NativeEngine:
         try:
             worker = pool.popleft()  # atomic: a deque is safe between threads
         except IndexError:
-            worker = _Worker(*(Batch(model, scenes, self._threads) for model in (self._mover, self._model)))
+            mover, looker = (Batch(model, scenes, self._threads) for model in (self._mover, self._model))
+            worker = _Worker(mover, looker)
             worker.batch.bind("ncon")
             worker.look.bind("sensordata")
         batch = worker.batch

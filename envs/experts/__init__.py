@@ -1,0 +1,10 @@
+"""The laws that agents follow when nothing is learned: one file each, chosen by their configuration."""
+
+from swarm_mjcf.lazy import lazy
+
+_PUBLIC = {
+    "BoidsConfig": "config",
+    "ExpertConfig": "config",
+    "make_expert": "registry",
+}
+__getattr__, __dir__, __all__ = lazy(__name__, _PUBLIC)

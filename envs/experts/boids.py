@@ -5,12 +5,10 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from envs.config import BoidsConfig
+from envs.experts.config import BoidsConfig
+from envs.policy import Policy
 from envs.record import Array
 from envs.state import State
-
-Policy = Callable[..., Array]
-"""`(state, params, key) -> acceleration (S, N, 2) [m/s^2]`, experts and learned alike; one key per scene."""
 
 Vectors = Float[Array, "S N 2"]
 Present = Bool[Array, "S N"]
