@@ -161,21 +161,27 @@ class Doctor:
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure: `engines` (scene-steps/s, as ratios to bare mujoco.batch), `imitation` (simulate, train, prediction
+    """Measure: `engines` (scene-steps/s, as ratios to bare mujoco.batch), `experts` (cost per agent up to 1000 agents),
+    `adapters` (Gymnasium, PettingZoo, dm_env, as ratios to the environment itself), `throughput` (10 agents and 5
+    obstacles with random actions and resets, batches up to 32k on a GPU), `imitation` (simulate, train, prediction
     error), `rendering` (frame rates), `build` (scenes per second).
 
     Example:
       swarmnet bench engines --json docs/results/bench-engines.json
     """
 
-    what: Literal["engines", "imitation", "rendering", "build"]
+    what: Literal["engines", "experts", "adapters", "throughput", "imitation", "rendering", "build"]
     """What to measure."""
     agents: tuple[int, ...] = (5, 10, 20, 100, 1000)
     """engines: numbers of agents, each with 1 obstacle."""
     substeps: tuple[int, ...] = (1, 15)
-    """engines: physics steps per control step."""
+    """engines, throughput: physics steps per control step."""
     repeats: int = 3
-    """engines: interleaved repetitions; medians are printed."""
+    """engines, experts, adapters: interleaved repetitions; medians are printed."""
+    engine: tuple[str, ...] = ("native", "mjx")
+    """throughput: engines to measure."""
+    batch: tuple[int, ...] = ()
+    """throughput: scenes per batch; by default 64 and 512 on a CPU, 1024 to 32768 on a GPU."""
     scenes: int = 2000
     """imitation: training scenes."""
     scale: float = 0.8

@@ -6,7 +6,7 @@ import os
 import platform
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from envs.trajectories import versions
@@ -31,9 +31,9 @@ class Results:
 
     name: str
     rows: list[Row]
-    dt: float | None
+    dt: float | None = None
     """Control step [s]; None where it has no meaning."""
-    seeds: list[int]
+    seeds: list[int] = field(default_factory=list)
     profile: str = "default"
 
 

@@ -1,8 +1,11 @@
 """`swarmnet bench`: prints `name.metric value` lines; what is compared is measured in the same run."""
 
+import re
 import tempfile
 import time
 from pathlib import Path
+
+import jax
 
 from envs.config import SimulateConfig
 from envs.simulate import simulate_in_memory
@@ -13,6 +16,7 @@ from gnn.train import train
 from swarm_mjcf.build import compile_scene
 from swarm_mjcf.spec import SceneSpec
 from swarmnet.bench_engines import bench_engines
+from swarmnet.bench_throughput import bench_throughput
 from swarmnet.commands.train import note
 from swarmnet.config import Bench
 from swarmnet.progress import progress
@@ -24,26 +28,13 @@ THESIS = {"published_mean 5 steps": 0.2338, "published_mean 40 steps": 2.778}
 
 def run(config: Bench) -> int:
     """Measures what was asked for."""
-    name, dt, seeds = f"bench-{config.what}", None, []
-    match config.what:
-        case "engines":
-            rows = _engines(config)
-        case "imitation":
-            rows, dt, seeds = _imitation(config), 0.3, [config.seed]
-        case "rendering":
-            from swarm_mjcf.render_bench import run as bench_rendering
-
-            rows = [Row("render", metric, value) for metric, value in bench_rendering()]
-            for row in rows:
-                print(f"{row.column} {row.value:.4g}")
-        case "build":
-            rows = _build()
+    results = _MEASURES[config.what](config)
     if config.json:
-        write_results(config.json, Results(name=name, rows=rows, dt=dt, seeds=seeds))
+        write_results(config.json, results)
     return 0
 
 
-def _engines(config: Bench) -> list[Row]:
+def _engines(config: Bench) -> Results:
     rows = []
     for rate in bench_engines(config.agents, config.substeps, repeats=config.repeats):
         if isinstance(rate, str):
@@ -56,10 +47,32 @@ def _engines(config: Bench) -> list[Row]:
         rows.append(Row(rate.case, f"{column} scene-steps/s", rate.per_second, unit="1/s"))
         rows.append(Row(rate.case, f"{column} ratio to bare", rate.ratio, unit="1"))
         rows.append(Row(rate.case, f"{column} scenes", rate.scenes, unit="scenes"))
-    return rows
+    return Results(name="bench-engines", rows=rows)
 
 
-def _imitation(config: Bench) -> list[Row]:
+def _throughput(config: Bench) -> Results:
+    rows, device = [], jax.devices()[0]
+    print(f"device: {device.device_kind}", flush=True)
+    batch = config.batch or ((64, 512) if device.platform == "cpu" else (1024, 4096, 16384, 32768))
+    for cell in bench_throughput(config.engine, batch, config.substeps, episodes=2, seed=config.seed):
+        column = f"S={cell.scenes} k={cell.substeps}"
+        figures = (
+            ("scene-steps/s", cell.control_steps_per_second, "1/s"),
+            ("physics steps/s", cell.control_steps_per_second * cell.substeps, "1/s"),
+            ("compile", cell.compile_seconds, "s"),
+            ("agent-states in contact", cell.contact_states, "1"),
+            ("peak memory", cell.peak_memory, "bytes"),
+        )
+        for figure, value, unit in figures:
+            if value is None:
+                continue
+            where = f"throughput.{cell.engine}.s{cell.scenes}.k{cell.substeps}"
+            print(f"{where}.{re.sub('[^a-z]+', '_', figure)} {value:.4g}", flush=True)
+            rows.append(Row(cell.engine, f"{column} {figure}", value, unit=unit))
+    return Results(name="bench-throughput", rows=rows, seeds=[config.seed])
+
+
+def _imitation(config: Bench) -> Results:
     """Published Boids, contacts off: simulate, train, predict unseen runs."""
     rows: list[Row] = []
 
@@ -96,14 +109,33 @@ def _imitation(config: Bench) -> list[Row]:
                 column = f"{kind} {horizon} steps"
                 reference = THESIS.get(column) if name.startswith("swarmnet") else None
                 show(name, column, value, "normalized MSE", reference)
-    return rows
+    return Results(name="bench-imitation", rows=rows, dt=0.3, seeds=[config.seed])
 
 
-def _build() -> list[Row]:
+def _build(config: Bench) -> Results:
     """Seconds for 1000 scenes of 20 agents from specification to compiled model, on one core."""
     begun = time.perf_counter()
     for arena in range(1000):  # 1000 different scenes
         compile_scene(SceneSpec(num_agents=20, arena=100.0 + arena))
     seconds = time.perf_counter() - begun
     print(f"build.seconds_per_1000_scenes_of_20 {seconds:.3f}")
-    return [Row("build", "seconds per 1000 scenes of 20 agents", seconds, unit="s")]
+    row = Row("build", "seconds per 1000 scenes of 20 agents", seconds, unit="s")
+    return Results(name="bench-build", rows=[row])
+
+
+def _rendering(config: Bench) -> Results:
+    from swarm_mjcf.render_bench import run as bench_rendering
+
+    rows = [Row("render", metric, value) for metric, value in bench_rendering()]
+    for row in rows:
+        print(f"{row.column} {row.value:.4g}")
+    return Results(name="bench-rendering", rows=rows)
+
+
+_MEASURES = {
+    "engines": _engines,
+    "throughput": _throughput,
+    "imitation": _imitation,
+    "rendering": _rendering,
+    "build": _build,
+}
