@@ -4,7 +4,12 @@ from swarm_mjcf.lazy import lazy
 
 _PUBLIC = {
     "BoidsConfig": "config",
+    "ChaserConfig": "config",
+    "EXPERTS": "config",
     "ExpertConfig": "config",
+    "HelbingConfig": "config",
+    "Interaction": "config",
+    "VicsekConfig": "config",
     "make_expert": "registry",
 }
 __getattr__, __dir__, __all__ = lazy(__name__, _PUBLIC)

@@ -5,7 +5,9 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from envs.experts.config import BoidsConfig
+from envs.experts.config import BoidsConfig, Interaction
+from envs.experts.goal import goal_seeking
+from envs.experts.pairs import Pairs, sum_over
 from envs.policy import Policy
 from envs.record import Array
 from envs.state import State
@@ -19,10 +21,11 @@ def boids(config: BoidsConfig) -> Policy:
 
     def policy(state: State, params: object = None, key: object = None) -> Vectors:
         total = jnp.zeros_like(state.position)
+        flocking = flock(state, config)  # once: the three rules share their neighbour search
         for name, rule in rules(config).items():
             weight = getattr(config, name)
             if weight:
-                total = total + weight * rule(state)
+                total = total + weight * (flocking[name] if name in flocking else rule(state))
         return jnp.where(state.agent_present[..., None], total, 0)
 
     return policy
@@ -31,35 +34,55 @@ def boids(config: BoidsConfig) -> Policy:
 def rules(config: BoidsConfig) -> dict[str, Callable[[State], Vectors]]:
     """The five rules by name, without their weights: `state -> (S, N, 2)`."""
     return {
-        "cohesion": lambda s: cohesion(s.position, s.agent_present),
-        "separation": lambda s: separation(s.position, s.agent_present, config),
-        "alignment": lambda s: cohesion(s.velocity, s.agent_present),
+        "cohesion": lambda s: flock(s, config)["cohesion"],
+        "separation": lambda s: flock(s, config)["separation"],
+        "alignment": lambda s: flock(s, config)["alignment"],
         "obstacle": lambda s: avoidance(s, config),
-        "goal": lambda s: goal_seeking(s.position, s.velocity, s.goal, config),
+        "goal": lambda s: goal_seeking(s, cruise_speed=config.cruise_speed, slowdown_distance=config.slowdown_distance),
     }
 
 
-def cohesion(quantity: Vectors, present: Present) -> Vectors:
-    """Mean over the others minus own: cohesion of positions, alignment of velocities; 0 for an agent alone."""
+def flock(state: State, config: BoidsConfig) -> dict[str, Vectors]:
+    """Cohesion, separation and alignment: mean position, push and mean velocity of the others seen, minus own.
+
+    Separation is the sum over others in range of (p_i - p_j) / d^2, d floored at 0.01 m; divided by the number of
+    others if not summed. An agent that sees nobody feels none of the three.
+    """
+    everyone = config.interaction.full
+    # Whom separation acts on is near: with everyone in sight the means come from totals, and only the near are visited.
+    interaction = Interaction(radius=config.separation_range) if everyone else config.interaction
+
+    def law(pairs: Pairs) -> dict[str, Array]:
+        distance = pairs.distance
+        push = 1 / jnp.maximum(distance, 0.01) ** 2
+        close = distance < config.separation_range
+        sums = {"push x": pairs.total(-pairs.dx * push, close), "push y": pairs.total(-pairs.dy * push, close)}
+        if not everyone:
+            for name, plane in (("x", pairs.dx), ("y", pairs.dy), ("u", pairs.du), ("w", pairs.dw), ("count", 1)):
+                sums[name] = pairs.total(plane)
+        return sums
+
+    present = state.agent_present
+    sums = sum_over(interaction, law, position=state.position, velocity=state.velocity, present=present)
+    push = jnp.stack([sums["push x"], sums["push y"]], axis=-1)
+    if everyone:
+        count = (present.sum(axis=1, keepdims=True) - present)[..., None].astype(push.dtype)
+        cohesion, alignment = mean_of_others(state.position, present), mean_of_others(state.velocity, present)
+    else:
+        count = sums["count"][..., None]
+        cohesion, alignment = (
+            jnp.stack([sums[x], sums[y]], axis=-1) / jnp.maximum(count, 1) for x, y in (("x", "y"), ("u", "w"))
+        )
+    separation = push if config.separation_summed else push / jnp.maximum(count, 1)
+    return {"cohesion": cohesion, "separation": separation, "alignment": alignment}
+
+
+def mean_of_others(quantity: Vectors, present: Present) -> Vectors:
+    """Mean over all others minus own, in O(N); 0 for an agent alone."""
     there = present[..., None].astype(quantity.dtype)
     others = there.sum(axis=1, keepdims=True) - there
     total = (quantity * there).sum(axis=1, keepdims=True) - quantity * there
     return jnp.where(others > 0, total / jnp.maximum(others, 1) - quantity, 0)
-
-
-def separation(position: Vectors, present: Present, config: BoidsConfig) -> Vectors:
-    """Sum over others in range of (p_i - p_j) / d^2, d floored at 0.01 m; divided by the others if not summed."""
-    # x and y as planes (S, N, N): a trailing axis of 2 would keep XLA from using vector instructions.
-    x, y = position[..., 0], position[..., 1]
-    dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
-    distance = jnp.sqrt(dx * dx + dy * dy)
-    agents = position.shape[1]
-    close = (distance < config.separation_range) & present[:, None] & ~jnp.eye(agents, dtype=bool)
-    push = jnp.where(close, 1 / jnp.maximum(distance, 0.01) ** 2, 0)
-    total = jnp.stack([jnp.sum(dx * push, axis=2), jnp.sum(dy * push, axis=2)], axis=-1)
-    if config.separation_summed:
-        return total
-    return total / jnp.maximum(present.sum(axis=1) - 1, 1)[:, None, None].astype(position.dtype)
 
 
 def avoidance(state: State, config: BoidsConfig) -> Vectors:
@@ -102,11 +125,3 @@ def avoidance(state: State, config: BoidsConfig) -> Vectors:
     strength = (size - miss) ** 2 / jnp.maximum(d, size)
     active = (miss < size) & (cosine > 0) & jnp.isfinite(d)
     return jnp.where(active, turn * jnp.where(active, strength, 0), 0)
-
-
-def goal_seeking(position: Vectors, velocity: Vectors, goal: Float[Array, "S 2"], config: BoidsConfig) -> Vectors:
-    """Wanted minus own velocity; wanted is toward the goal at `cruise_speed min(1, D / slowdown_distance)`."""
-    toward = goal[:, None] - position
-    distance = jnp.sqrt(jnp.sum(toward * toward, axis=-1, keepdims=True))
-    wanted = config.cruise_speed * jnp.minimum(1, distance / config.slowdown_distance)
-    return wanted * toward / jnp.maximum(distance, 1e-12) - velocity
