@@ -21,7 +21,9 @@ class Recording:
     """Agents' positions [m] at steps 0..T."""
     velocity: Float[Array, "S T1 N 2"]
     contacts: Contacts
-    """Fields with a time axis after the scenes: (S, T, N)."""
+    """Fields with a time axis after the scenes: (S, T, N); `saturated` is (S, T)."""
+    obstacle: Float[Array, "S T1 K 2"] | None = None
+    """Obstacles' positions [m] at steps 0..T; None: they stood still where `start` has them."""
 
 
 def rollout(
@@ -35,15 +37,16 @@ def rollout(
     def step(state: State, t: Array):
         step_keys = jax.vmap(partial(jax.random.fold_in, data=t))(keys)
         transition = env.step(state, policy(state, params, step_keys))
-        return transition.state, (transition.state.position, transition.state.velocity, transition.contacts)
+        return transition.state, (seen(transition.state), transition.contacts)
 
-    _, (position, velocity, contacts) = jax.lax.scan(step, start, jnp.arange(steps))
-    position = jnp.concatenate([start.position[None], position])
-    velocity = jnp.concatenate([start.velocity[None], velocity])
-    swap = partial(jnp.swapaxes, axis1=0, axis2=1)
-    return Recording(
-        start=start, position=swap(position), velocity=swap(velocity), contacts=jax.tree.map(swap, contacts)
-    )
+    def seen(state: State) -> dict[str, Array]:
+        moving = {"obstacle": state.obstacle} if env.spec.moving_obstacles else {}
+        return {"position": state.position, "velocity": state.velocity, **moving}
+
+    _, (after, contacts) = jax.lax.scan(step, start, jnp.arange(steps))
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), seen(start), after)
+    states, contacts = jax.tree.map(partial(jnp.swapaxes, axis1=0, axis2=1), (states, contacts))
+    return Recording(start=start, contacts=contacts, **states)
 
 
 def make_rollout(env: SwarmEnv, policy: Policy, *, steps: int):

@@ -52,6 +52,9 @@ class Contacts:
     """Deepest penetration of another agent [m]; 0 without contact."""
     obstacle_depth: Float[Array, "S N"]
     wall_depth: Float[Array, "S N"]
+    saturated: Int[Array, " S"]
+    """Number of the k states at which an engine's contact cap was full, so that contacts may be missing from all fields
+    above; 0 without caps."""
 
 
 def no_contacts(scenes: int, agents: int) -> Contacts:
@@ -67,6 +70,7 @@ def no_contacts(scenes: int, agents: int) -> Contacts:
         agent_depth=depth,
         obstacle_depth=depth,
         wall_depth=depth,
+        saturated=jnp.zeros(scenes, jnp.int32),
     )
 
 

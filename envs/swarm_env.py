@@ -36,6 +36,22 @@ def scene_keys(seed: int, scenes: Int[Array, " S"] | range) -> Key[Array, " S"]:
     return jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(jnp.asarray(np.asarray(scenes), jnp.uint32))
 
 
+def check_obstacles(state: State, spec: SceneSpec) -> None:
+    """Raises SpecError where an obstacle of a state made by hand outruns `max_speed`: it could cross a body unseen."""
+    if np.asarray(_outrun(state, spec)).any():
+        speed = np.linalg.norm(np.asarray(state.obstacle_velocity), axis=-1).max()
+        raise SpecError("obstacle_velocity", float(speed), f"at most max_speed = {spec.max_speed} m/s with contacts on")
+
+
+def _outrun(state: State, spec: SceneSpec) -> Bool[Array, " S"]:
+    """Whether a moving obstacle of the scene is faster than contacts allow, or not finite."""
+    if not (spec.moving_obstacles and spec.contacts):
+        return jnp.zeros(len(state.position), bool)
+    square = jnp.sum(jnp.asarray(state.obstacle_velocity) ** 2, axis=-1)
+    within = square <= spec.max_speed**2 * (1 + 1e-5)  # float32 may round a speed at the limit up
+    return (~within & state.obstacle_present).any(axis=1)
+
+
 class SwarmEnv:
     """S scenes at once. `step` is callable inside `jit` and `lax.scan`; so is `spawn`; `reset` checks and may raise.
 
@@ -75,30 +91,48 @@ class SwarmEnv:
         failed = int(np.sum(~np.asarray(ok)))
         if failed:
             raise too_dense(self.spec, self.spawn_config, failed, len(ok))
+        check_obstacles(state, self.spec)
         return state
 
     def step(self, state: State, acceleration: Float[Array, "S N 2"]) -> Transition:
         """One control step. `acceleration` [m/s^2] is clipped to the limits, and absent agents do nothing.
 
-        A scene with a non-finite state or acceleration never reaches the engine: its bodies become NaN and stay so.
+        A scene with a non-finite state or acceleration, or with an obstacle that outruns the speed limit (see
+        `check_obstacles`), never reaches the engine: its bodies become NaN and stay so.
         """
         finite = jnp.isfinite(acceleration).all((1, 2)) & jnp.isfinite(state.position).all((1, 2))
-        finite &= jnp.isfinite(state.velocity).all((1, 2))
+        finite &= jnp.isfinite(state.velocity).all((1, 2)) & jnp.isfinite(state.obstacle).all((1, 2))
+        finite &= ~_outrun(state, self.spec)
 
-        def safe(x: Array) -> Array:
-            return jnp.where(finite[:, None, None], x, 0)
+        def safe(x: Array, instead: Array | int = 0) -> Array:
+            return jnp.where(finite[:, None, None], x, instead)
 
         wanted = jnp.where(state.agent_present[..., None], safe(acceleration), 0)
-        sound = replace(state, position=safe(state.position), velocity=safe(state.velocity))
+        # A sick scene's bodies wait where absent ones do: in one place they would fill the engine's contacts.
+        agents, obstacles = (jnp.asarray(p, state.position.dtype).reshape(-1, 2) for p in self.spec.parking())
+        sound = replace(
+            state,
+            position=safe(state.position, agents),
+            velocity=safe(state.velocity),
+            obstacle=safe(state.obstacle, obstacles),
+            obstacle_velocity=safe(state.obstacle_velocity),
+        )
         executed = limited(sound.velocity, wanted, self.spec)
         after, contacts = self.engine.step(sound, executed)
-        contacts = jax.tree.map(lambda x: jnp.where(finite[:, None], x, 0), contacts)
+        contacts = jax.tree.map(lambda x: jnp.where(finite.reshape(-1, *[1] * (x.ndim - 1)), x, 0), contacts)
 
         def sick(x: Array) -> Array:
             return jnp.where(finite[:, None, None], x, jnp.nan).astype(x.dtype)
 
         step = state.step + 1
-        after = replace(after, position=sick(after.position), velocity=sick(after.velocity), step=step)
+        after = replace(
+            after,
+            position=sick(after.position),
+            velocity=sick(after.velocity),
+            obstacle=jnp.where(finite[:, None, None], after.obstacle, state.obstacle),
+            obstacle_velocity=state.obstacle_velocity,
+            step=step,
+        )
         touched = (contacts.agent_states + contacts.obstacle_states + contacts.wall_states).any(axis=1)
         return Transition(
             state=after,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -61,8 +62,13 @@ class Trajectories:
     """[m/s^2]"""
     provenance: dict
     """Scene, expert, seed, engine, versions: plain JSON."""
+    saturated: Int[np.ndarray, "S T"] = None  # pyright: ignore[reportAssignmentType]
+    """Number of substep states at which the engine's contact cap was full, so that contacts may be missing; when not
+    given (there was no engine), zeros."""
 
     def __post_init__(self) -> None:
+        if self.saturated is None:
+            object.__setattr__(self, "saturated", np.zeros(self.mask.shape[:2], np.int16))
         for name in ("position", "velocity"):
             bad = ~np.isfinite(getattr(self, name)).all(axis=-1) & self.mask
             if bad.any():
@@ -88,7 +94,7 @@ class Trajectories:
 
 ARRAYS = (
     "position", "velocity", "mask", "kind", "radius", "edges",
-    "agent_contact", "solid_contact", "agent_events", "solid_events", "depth",
+    "agent_contact", "solid_contact", "agent_events", "solid_events", "depth", "saturated",
 )  # fmt: skip
 """The array fields of `Trajectories`, in the order of the file."""
 
@@ -113,10 +119,19 @@ def from_recording(recording: Recording, spec: SceneSpec, provenance: dict) -> T
     start = recording.start
     position, velocity = np.asarray(recording.position), np.asarray(recording.velocity)
     scenes, rows, agents, _ = position.shape
-    still = np.asarray(start.obstacle)
+    contacts = recording.contacts
+    _warn_of_saturation(np.asarray(contacts.saturated), spec.substeps)
+
+    def throughout(value: Array) -> np.ndarray:
+        return np.repeat(np.asarray(value)[:, None], rows, axis=1)
+
+    obstacle = throughout(start.obstacle) if recording.obstacle is None else np.asarray(recording.obstacle)
+    velocities = throughout(np.asarray(start.obstacle_velocity) * spec.moving_obstacles)
     if spec.goal:
-        still = np.concatenate([np.asarray(start.goal)[:, None], still], axis=1)
-    nodes = still.shape[1]
+        goal = throughout(start.goal)[:, :, None]
+        obstacle = np.concatenate([goal, obstacle], axis=2)
+        velocities = np.concatenate([np.zeros_like(goal), velocities], axis=2)
+    nodes = obstacle.shape[2]
     present = np.concatenate(
         [np.ones((scenes, int(spec.goal)), bool), np.asarray(start.obstacle_present), np.asarray(start.agent_present)],
         1,
@@ -125,11 +140,8 @@ def from_recording(recording: Recording, spec: SceneSpec, provenance: dict) -> T
     kind = np.broadcast_to(kind, (scenes, nodes + agents)).copy()
     mask = np.broadcast_to(present[:, None], (scenes, rows, nodes + agents)).copy()
 
-    def nodes_of(moving: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-        fixed = np.broadcast_to(fixed[:, None], (scenes, rows, nodes, 2))
-        return np.where(mask[..., None], np.concatenate([fixed, moving], axis=2), 0).astype(np.float32)
-
-    contacts = recording.contacts
+    def nodes_of(agents: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return np.where(mask[..., None], np.concatenate([others, agents], axis=2), 0).astype(np.float32)
 
     def per_row(values: Array, dtype: type = np.int16) -> np.ndarray:
         full = np.zeros((scenes, rows, nodes + agents), dtype)
@@ -138,8 +150,8 @@ def from_recording(recording: Recording, spec: SceneSpec, provenance: dict) -> T
 
     radius = np.select([kind == AGENT, kind == OBSTACLE], [spec.agent_radius, spec.obstacle_radius], 0.0)
     return Trajectories(
-        position=nodes_of(position, still),
-        velocity=nodes_of(velocity, np.zeros_like(still)),
+        position=nodes_of(position, obstacle),
+        velocity=nodes_of(velocity, velocities),
         mask=mask,
         kind=kind,
         radius=np.where(present, radius, 0).astype(np.float32),
@@ -156,7 +168,18 @@ def from_recording(recording: Recording, spec: SceneSpec, provenance: dict) -> T
         max_speed=spec.max_speed,
         max_acceleration=spec.max_acceleration,
         provenance=provenance,
+        saturated=np.pad(np.asarray(contacts.saturated), ((0, 0), (1, 0))).astype(np.int16),
     )
+
+
+def _warn_of_saturation(saturated: Int[np.ndarray, "S T"], substeps: int) -> None:
+    if saturated.any():
+        warnings.warn(
+            f"contacts may be missing: the engine's contact cap was full at {saturated.sum()} of "
+            f"{saturated.size * substeps} states, in {saturated.any(axis=1).sum()} of {len(saturated)} scenes; give "
+            "the engine larger caps",
+            stacklevel=3,
+        )
 
 
 def versions() -> dict[str, str]:

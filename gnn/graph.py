@@ -47,13 +47,12 @@ def graph_of_state(state: State, *, goal: bool) -> tuple[Float[Array, "S V 4"], 
     scenes, agents, _ = state.position.shape
     here = state.agent_present
     goals = jnp.ones((scenes, int(goal)), bool)
-    still = jnp.where(state.obstacle_present[..., None], state.obstacle, 0)
+    obstacles = jnp.concatenate([state.obstacle, state.obstacle_velocity], axis=-1)
+    steered = jnp.concatenate([state.position, state.velocity], axis=-1)
+    parts = [jnp.where(state.obstacle_present[..., None], obstacles, 0), jnp.where(here[..., None], steered, 0)]
     if goal:
-        still = jnp.concatenate([state.goal[:, None], still], axis=1)
-    moving = jnp.concatenate([state.position, state.velocity], axis=-1)
-    nodes = jnp.concatenate(
-        [jnp.concatenate([still, jnp.zeros_like(still)], axis=-1), jnp.where(here[..., None], moving, 0)], axis=1
-    )
+        parts.insert(0, jnp.concatenate([state.goal, jnp.zeros_like(state.goal)], axis=-1)[:, None])
+    nodes = jnp.concatenate(parts, axis=1)
     others = ~np.eye(agents, dtype=bool)
     graph = Graph(
         present=jnp.concatenate([goals, state.obstacle_present, here], axis=1),

@@ -43,6 +43,11 @@ class SceneSpec:
     """Half-width of the arena [m]: positions lie in [-arena, arena]^2."""
     walls: bool = False
     """Whether solid walls stand at the arena's border (an expert's virtual walls are no bodies)."""
+    moving_obstacles: bool = False
+    """Whether obstacles move, each at the constant velocity of its state: at most `max_speed` where contacts are on, so
+    that the rule for the timestep holds for them too. Nothing stops or deflects them, walls included. Whom they push
+    sinks into them by what they move in 4 physics steps (0.4 m at 10 m/s and 0.01 s): MuJoCo gives such bodies no
+    velocity."""
     dt: float = 0.3
     """Control step [s]."""
     substeps: int = 30
@@ -64,6 +69,9 @@ class SceneSpec:
             value = getattr(self, field)
             if isinstance(value, bool) or not isinstance(value, int) or value < low:
                 raise SpecError(field, value, f"a whole number of at least {low}")
+        for field in ("goal", "walls", "moving_obstacles", "contacts"):
+            if not isinstance(getattr(self, field), bool):
+                raise SpecError(field, getattr(self, field), "True or False")
         for field, unit in (
             ("agent_radius", "m"),
             ("obstacle_radius", "m"),

@@ -124,7 +124,7 @@ def bench_engines(agents: tuple[int, ...], substeps: tuple[int, ...], *, repeats
             yield from (rate for rate in _case(cases, (count, k, few, repeats)) if rate.case != "bare")
             on_cpu = jax.default_backend() == "cpu"
             if count > (100 if on_cpu else 200):
-                yield f"mjx, {count} agents, {k} substeps: left out, it keeps all {count * (count + 1) // 2} pairs"
+                yield f"mjx, {count} agents, {k} substeps: left out, it visits all {count * (count + 1) // 2} pairs"
                 continue
             few = min(scenes, max(2, 2048 * 25 // count**2)) if on_cpu else scenes
             part = _start(spec, few)

@@ -296,3 +296,10 @@ def test_the_model_for_stepping_alone_has_the_same_physics_and_addresses(walls):
     assert touched > 20
     for field in ("qpos", "qvel", "qacc", "sensordata"):
         np.testing.assert_array_equal(getattr(data[0], field), getattr(data[1], field))
+
+
+def test_engines_settings_become_custom_numbers_and_nothing_else():
+    model = compile_physics(SPEC, {"max_contact_points": 12.0})
+    assert model.numeric("max_contact_points").data.tolist() == [12]
+    assert compile_physics(SPEC).nnumeric == 0
+    np.testing.assert_array_equal(model.geom_size, compile_physics(SPEC).geom_size)

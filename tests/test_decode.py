@@ -59,11 +59,23 @@ def test_an_acceleration_passes_through_free_flight():
 def test_static_nodes_stay_and_ghosts_do_not_move(name: str):
     config, history, present, graph, params = swarm(name)
     history = np.where(present[:, None, :, None], history, 7.0).astype(np.float32)
+    history[:, :, :FIRST, 2:] = 0
     after = np.asarray(compiled(config, INTEGRATOR)(params, history, graph, horizon=4))
     for step in range(4):
         np.testing.assert_array_equal(after[:, step, :FIRST], history[:, 0, :FIRST])
         np.testing.assert_array_equal(after[:, step][~present], history[:, 0][~present])
     assert (after[:, 0, FIRST:][present[:, FIRST:]] != history[:, 0, FIRST:][present[:, FIRST:]]).any(axis=-1).all()
+
+
+def test_a_moving_obstacle_keeps_its_velocity():
+    config, history, _, graph, params = swarm("best")
+    history = history.copy()
+    history[:, :, 1, 2:] = [3.0, -2.0]
+    after = np.asarray(compiled(config, INTEGRATOR)(params, history, graph, horizon=4))
+    for step in range(4):
+        moved = history[:, 0, 1, :2] + np.float32(0.3 * (step + 1)) * np.float32([3, -2])
+        np.testing.assert_allclose(after[:, step, 1, :2], moved, atol=1e-5)
+        np.testing.assert_array_equal(after[:, step, 1, 2:], history[:, 0, 1, 2:])
 
 
 def test_a_state_change_is_added_to_the_last_state():

@@ -47,7 +47,9 @@ def test_a_bad_value_is_refused_with_field_given_and_allowed(field: str, value: 
 
 def test_a_value_of_a_wrong_type_is_refused_too():
     """In a process of its own: here the type checker of the tests would be faster."""
-    fields = [field.name for field in dataclasses.fields(SceneSpec) if field.name not in ("goal", "walls", "contacts")]
+    switches = [field.name for field in dataclasses.fields(SceneSpec) if isinstance(field.default, bool)]
+    fields = [field.name for field in dataclasses.fields(SceneSpec) if field.name not in switches]
+    assert set(switches) == {"goal", "walls", "contacts", "moving_obstacles"}
     code = f"""
 from swarm_mjcf.spec import SceneSpec, SpecError
 for field in {fields}:
@@ -56,6 +58,14 @@ for field in {fields}:
             SceneSpec(**{{field: value}})
         except SpecError as error:
             assert error.field == field and error.given is value and error.allowed, error
+        else:
+            print("accepted", field, value)
+for field in {switches}:
+    for value in ("yes", None, 1, 0.0):
+        try:
+            SceneSpec(**{{field: value}})
+        except SpecError as error:
+            assert error.field == field and error.given is value and error.allowed == "True or False", error
         else:
             print("accepted", field, value)
 SceneSpec(agent_radius=1, dt=1, max_speed=5, substeps=50)  # whole numbers are numbers

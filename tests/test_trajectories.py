@@ -138,3 +138,10 @@ def test_settings_become_plain_json():
 
 def test_versions_name_the_packages_whose_numbers_matter():
     assert {"mujoco", "jax", "numpy"} <= set(versions())
+
+
+def test_without_an_engine_nothing_is_saturated(crash):
+    t = make_trajectories(scenes=3, rows=5)
+    assert t.saturated.shape == (3, 5)
+    assert not t.saturated.any()
+    assert not crash[1].saturated.any()  # the native engine has no caps

@@ -1,4 +1,4 @@
-"""Physics engines behind one protocol. Names: `native` (C, threads), `mjx` (XLA)."""
+"""Physics engines behind one protocol. Names: `native` (C, threads), `mjx` (XLA), `mjx-warp` (CUDA; an extra)."""
 
 from typing import TYPE_CHECKING
 
@@ -9,12 +9,15 @@ if TYPE_CHECKING:
     from envs.engines.engine import Engine
 
 ENGINES = ("native", "mjx")
+OPTIONAL_ENGINES = ("mjx-warp",)
+"""Engines that an extra installs: `pip install 'swarmnet-mujoco[warp]'`."""
 
 
 def make_engine(spec: SceneSpec, name: str = "auto", *, threads: int = 0) -> "Engine":
     """An engine by name; `auto` takes `mjx` where JAX has a GPU or TPU and `native` elsewhere.
 
-    `threads` is for the native engine; 0 takes every CPU. Raises SpecError for a name that does not exist.
+    `threads` is for the native engine; 0 takes every CPU. Raises SpecError for a name that does not exist, EngineError
+    for an engine that is not installed.
     """
     if name == "auto":
         import jax
@@ -28,4 +31,8 @@ def make_engine(spec: SceneSpec, name: str = "auto", *, threads: int = 0) -> "En
         from envs.engines.mjx import MjxEngine
 
         return MjxEngine(spec)
-    raise SpecError("engine", name, "one of auto, " + ", ".join(ENGINES))
+    if name == "mjx-warp":
+        from envs.engines.mjx_warp import MjxWarpEngine
+
+        return MjxWarpEngine(spec)
+    raise SpecError("engine", name, "one of auto, " + ", ".join(ENGINES + OPTIONAL_ENGINES))

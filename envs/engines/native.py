@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
-from mujoco.batch import Batch
+from mujoco.batch import Batch, SimulationError
 
 from envs.dynamics import free_flight
-from envs.engines.engine import read_sensors
+from envs.engines.engine import EngineError, obstacle_path, read_sensors, with_obstacles_moved
 from envs.record import Array
 from envs.state import Contacts, State, no_contacts
 from swarm_mjcf.build import compile_physics
@@ -92,9 +92,13 @@ class NativeEngine:
         parts = (state.position, state.velocity, still, acceleration.astype(dtype))
         bodies = jnp.concatenate([part.reshape(scenes, -1) for part in parts], axis=1)
         moved = jax.ShapeDtypeStruct((scenes, 4 * agents), dtype)
+        path = obstacle_path(state, self.spec)
+        after = with_obstacles_moved(state, path, self.spec)
         if not self.spec.contacts:
             out = jax.pure_callback(self._advance, moved, bodies, state.obstacle, vmap_method="sequential")
-            return replace(state, **_unpacked(out)), no_contacts(scenes, agents)
+            return replace(after, **_unpacked(out)), no_contacts(scenes, agents)
+        if not self.spec.moving_obstacles:
+            path = path[:, :1]  # placed once, for all substeps
         flags = jnp.concatenate(
             [state.touching_agent[..., None], state.touching_wall[..., None], state.touching_obstacle], axis=-1
         )
@@ -104,19 +108,19 @@ class NativeEngine:
             jax.ShapeDtypeStruct((len(_COUNTS), scenes, agents), np.int32),
             jax.ShapeDtypeStruct((len(_DEPTHS), scenes, agents), np.float32),
         )
-        arguments = (bodies, state.obstacle, flags, self._near(state, acceleration))
+        arguments = (bodies, path, flags, self._near(after, acceleration))
         out, flags, counts, depths = jax.pure_callback(
             self._advance_with_contacts, shapes, *arguments, vmap_method="sequential"
         )
-        state = replace(
-            state,
+        after = replace(
+            after,
             **_unpacked(out),
             touching_agent=flags[..., 0],
             touching_wall=flags[..., 1],
             touching_obstacle=flags[..., 2:],
         )
         fields = dict(zip(_COUNTS + _DEPTHS, [*counts, *depths], strict=True))
-        return state, Contacts(**fields)
+        return after, Contacts(**fields, saturated=jnp.zeros(scenes, jnp.int32))
 
     @contextlib.contextmanager
     def _loaded(self, bodies: np.ndarray, obstacle: np.ndarray) -> Iterator[_Worker]:
@@ -133,8 +137,32 @@ class NativeEngine:
         batch = worker.batch
         batch.state[:, self._bodies] = bodies
         batch.mocap_pos[:, index.obstacle_mocap, :2] = obstacle
-        yield worker
+        try:
+            yield worker
+        except SimulationError as error:
+            raise EngineError(f"native: {error}") from error
+        self._check_warnings(worker)
         pool.append(worker)  # a worker of a call that raised is dropped
+
+    def _check_warnings(self, worker: _Worker) -> None:
+        """Raises EngineError where MuJoCo only counts a warning: it has dropped contacts, or reset the scene."""
+        counts = worker.batch.warning[..., 1] + worker.look.warning[..., 1]
+        if not counts.any():
+            return
+        scene, kind = (int(i) for i in np.argwhere(counts)[0])
+        raise EngineError(
+            f"native: MuJoCo warned of {mujoco.mjtWarning(kind).name} in {np.count_nonzero(counts.any(axis=1))} of "
+            f"{len(counts)} scenes, first in scene {scene}; CONTACTFULL and CNSTRFULL: more bodies pressed into each "
+            f"other than the {self._model.narena // 1024} KB that hold a scene's contacts have room for"
+        )
+
+    def _places(self, batch: Batch, path: np.ndarray) -> np.ndarray | None:
+        """Where all mocap bodies are at states 0..k-1, (S, k, 3 * bodies); None where they stand still."""
+        if not self.spec.moving_obstacles:
+            return None
+        places = np.repeat(batch.mocap_pos[:, None], self.spec.substeps, axis=1)
+        places[:, :, self._index.obstacle_mocap, :2] = path[:, :-1]
+        return places.reshape(*places.shape[:2], -1)
 
     def _moved(self, batch: Batch, bodies: np.ndarray) -> Float[np.ndarray, "S M"]:
         """Positions and velocities of all agents, (S, 4N)."""
@@ -146,22 +174,25 @@ class NativeEngine:
             worker.batch.step(nstep=self.spec.substeps)
             return self._moved(worker.batch, bodies)
 
-    def _advance_with_contacts(self, bodies: Array, obstacle: Array, flags: Array, near: Array) -> tuple:
-        bodies, obstacle, flags, near = (np.asarray(x) for x in (bodies, obstacle, flags, near))
+    def _advance_with_contacts(self, bodies: Array, path: Array, flags: Array, near: Array) -> tuple:
+        bodies, path, flags, near = (np.asarray(x) for x in (bodies, path, flags, near))
         k, index = self.spec.substeps, self._index
         scenes, agents = len(bodies), self.spec.num_agents
-        with self._loaded(bodies, obstacle) as worker:
+        with self._loaded(bodies, path[:, 0]) as worker:
             batch, look = worker.batch, worker.look
             if k == 1:
                 batch.step()
                 touched, positions = worker.batch.ncon > 0, batch.qpos[:, None]
                 recorded = np.empty((scenes, 0, look.sensordata.shape[1]))
             else:
-                worker.records = batch.rollout(k, record=("sensordata", "qpos", "ncon"), out=worker.records)
+                record, place = ("sensordata", "qpos", "ncon"), int(mujoco.mjtState.mjSTATE_MOCAP_POS)
+                worker.records = batch.rollout(k, self._places(batch, path), place, record, out=worker.records)
                 # A record describes the state before its substep: sensors 1.. are those of states 1..k-1.
                 recorded, positions = worker.records["sensordata"][:, 1:], worker.records["qpos"]
                 touched = worker.records["ncon"].reshape(scenes, k).any(axis=1)
             moved = self._moved(batch, bodies)
+            if self.spec.moving_obstacles:
+                batch.mocap_pos[:, index.obstacle_mocap, :2] = path[:, k]
 
             # Scenes where nothing touches, most of them, are done: zeros.
             now = np.zeros_like(flags)
