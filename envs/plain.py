@@ -12,10 +12,14 @@ def plain(config: Any) -> dict[str, Any]:
 def from_plain[T](kind: type[T], values: dict[str, Any]) -> T:
     """The `kind` that `plain` wrote; entries that it does not have are left out.
 
-    Raises KeyError for a missing entry, and what `kind` raises for bad values.
+    A missing entry is its default: what was written before the field existed. Raises KeyError for one without a
+    default, and what `kind` raises for bad values.
     """
     own: Any = kind
-    values = {field.name: values[field.name] for field in dataclasses.fields(own)}
+    needed = (f.name for f in dataclasses.fields(own) if f.default is f.default_factory is dataclasses.MISSING)
+    values = {f.name: values[f.name] for f in dataclasses.fields(own) if f.name in values} | {
+        name: values[name] for name in needed
+    }
     return kind(**{key: _restored(value) for key, value in values.items()})
 
 

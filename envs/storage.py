@@ -6,8 +6,8 @@ import io
 import json
 import os
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,13 @@ import numpy as np
 from envs.trajectories import ARRAYS, Trajectories, TrajectoryError, concatenate
 
 FORMAT = "swarmnet-trajectories"
-VERSION = 1
+VERSION = 2
 SLAB = 256
 """Scenes per HDF5 chunk and per checksum: what a streaming reader holds at least."""
 _SIGNATURE, _MARK = b"\x89HDF\r\n\x1a\n", b"SWARMCRC"
 """How HDF5 files begin, and what precedes the checksum (CRC-32) of all bytes before it, at the end of ours."""
+_LATER = {"saturated": 2}
+"""Arrays and the version of the format that brought them; files of an earlier one are read with their default."""
 _SCALARS = ("dt", "substeps", "max_speed", "max_acceleration")
 
 
@@ -194,7 +196,7 @@ class TrajectoryWriter:
             data.resize(data.shape[0] + len(array), axis=0)
             data[-len(array) :] = array
             self._disk.check()
-        self._digests.append(_digest(slab))
+        self._digests.append(_digest(slab, ARRAYS))
 
     def _check_like(self, part: Trajectories, earlier: Trajectories) -> None:
         for name in (*ARRAYS, *_SCALARS):
@@ -242,15 +244,15 @@ def _header(path: str | Path, file: h5py.File) -> Header:
 def stream(path: str | Path) -> Iterator[Trajectories]:
     """Slabs of at most `SLAB` scenes, each checked against its checksum."""
     with _opened(path) as file:
-        header = _header(path, file)
+        header, names = _header(path, file), _names(file)
         digests = json.loads(str(file.attrs["digests"]))
         for number, start in enumerate(range(0, header.scenes, SLAB)):
             slab = Trajectories(
-                **{name: _array(file, name)[start : start + SLAB] for name in ARRAYS},
+                **{name: _array(file, name)[start : start + SLAB] for name in names},
                 **{name: getattr(header, name) for name in _SCALARS},
                 provenance=header.provenance,
             )
-            if _digest(slab) != digests[number]:
+            if _digest(slab, names) != digests[number]:
                 raise TrajectoryError(f"{path}: scenes {start} to {start + len(slab) - 1} do not match their checksum")
             yield slab
 
@@ -267,6 +269,14 @@ def load(path: str | Path, *, scenes: int | None = None) -> Trajectories:
         raise TrajectoryError(f"{path}: {scenes} scenes were asked for, it holds {have}")
     whole = concatenate(parts)
     return whole if scenes is None else whole.take(slice(0, scenes))
+
+
+def join(parts: Sequence[Path], path: Path, provenance: dict) -> None:
+    """Writes the scenes of all parts, in this order, to one file; only a slab at a time is in memory."""
+    with TrajectoryWriter(path) as writer:
+        for part in parts:
+            for slab in stream(part):
+                writer.append(replace(slab, provenance=provenance))
 
 
 def _remove_abandoned(path: Path) -> None:
@@ -292,9 +302,18 @@ def _scalars(attrs: Any) -> dict[str, Any]:
     return {name: attrs[name].item() for name in _SCALARS}
 
 
-def _digest(slab: Trajectories) -> str:
+def _names(file: h5py.File) -> tuple[str, ...]:
+    """The arrays that a file of its version has."""
+    return tuple(name for name in ARRAYS if _LATER.get(name, 1) <= _version(file))
+
+
+def _version(file: h5py.File) -> int:
+    return int(str(file.attrs["version"]))
+
+
+def _digest(slab: Trajectories, names: tuple[str, ...]) -> str:
     digest = hashlib.sha256()
-    for name in ARRAYS:
+    for name in names:
         digest.update(np.ascontiguousarray(getattr(slab, name)).view(np.uint8).data)
     return digest.hexdigest()
 
@@ -302,7 +321,7 @@ def _digest(slab: Trajectories) -> str:
 def _seal(file: h5py.File) -> str:
     """Checksum of everything that is not in a slab's checksum."""
     attrs = {name: str(file.attrs[name]) for name in ("version", "slab", *_SCALARS, "provenance", "digests")}
-    arrays = {name: _array(file, name) for name in ARRAYS}
+    arrays = {name: _array(file, name) for name in _names(file)}
     shapes = {name: [list(array.shape), str(array.dtype)] for name, array in arrays.items()}
     return hashlib.sha256(json.dumps([attrs, shapes], sort_keys=True).encode()).hexdigest()
 
@@ -314,10 +333,8 @@ def _opened(path: str | Path) -> Iterator[h5py.File]:
     with _explained(path, "read"), h5py.File(path, "r") as file:
         if file.attrs.get("format") != FORMAT:
             raise TrajectoryError(f"{path}: an HDF5 file, but not of trajectories (no '{FORMAT}' header)")
-        if file.attrs["version"] != VERSION:
-            raise TrajectoryError(
-                f"{path}: version {file.attrs['version']} of the format, this program reads {VERSION}"
-            )
+        if not 1 <= _version(file) <= VERSION:
+            raise TrajectoryError(f"{path}: version {_version(file)} of the format, this program reads 1 to {VERSION}")
         if file.attrs.get("seal") != _seal(file):
             raise TrajectoryError(f"{path}: corrupt, its header does not match its checksum")
         yield file

@@ -14,7 +14,8 @@ from helpers import assert_same_trajectories, make_trajectories
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.storage import SLAB, TrajectoryWriter, ending, load, read_header, save, stream
+from envs import storage
+from envs.storage import SLAB, TrajectoryWriter, ending, join, load, read_header, save, stream
 from envs.trajectories import TrajectoryError, concatenate
 
 ROOT = Path(__file__).parents[1]
@@ -308,6 +309,36 @@ def test_a_newer_version_is_refused_by_number(path: Path):
     with_a_right_ending(path)
     with pytest.raises(TrajectoryError, match="version 99"):
         load(path)
+
+
+def test_a_file_of_the_first_version_is_read_with_zeros_for_what_it_lacks(path: Path, monkeypatch):
+    whole = make_trajectories(scenes=SLAB + 3, rows=2)
+    with monkeypatch.context() as then:
+        then.setattr(storage, "VERSION", 1)
+        then.setattr(storage, "ARRAYS", tuple(name for name in storage.ARRAYS if name != "saturated"))
+        save(path, whole)
+    with h5py.File(path) as file:
+        assert (file.attrs["version"], "saturated" in file) == (1, False)
+    assert_same_trajectories(load(path), whole)
+    assert not load(path).saturated.any()
+    with h5py.File(path, "r+") as file:
+        file["position"][SLAB] += 1
+    with_a_right_ending(path)
+    with pytest.raises(TrajectoryError, match="do not match their checksum"):
+        load(path)
+
+
+@pytest.mark.parametrize("sizes", [(5, SLAB, 1), (SLAB + 6,)])
+def test_joined_parts_are_the_file_that_one_call_writes(tmp_path: Path, sizes: tuple[int, ...]):
+    whole = make_trajectories(scenes=sum(sizes), rows=2)
+    parts, start = [], 0
+    for size in sizes:
+        parts.append(tmp_path / f"{start}.h5")
+        save(parts[-1], replace(whole.take(slice(start, start + size)), provenance={"part": start}))
+        start += size
+    join(parts, tmp_path / "joined.h5", whole.provenance)
+    save(tmp_path / "whole.h5", whole)
+    assert (tmp_path / "joined.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
 
 
 @pytest.mark.skipif(not Path("/proc/sys").is_dir(), reason="needs Linux's read-only /proc")
