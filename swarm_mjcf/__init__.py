@@ -4,6 +4,7 @@ from swarm_mjcf import gl  # noqa: F401  (settles MUJOCO_GL before anything impo
 from swarm_mjcf.lazy import lazy
 
 _PUBLIC = {
+    "Camera": "camera",
     "Playback": "playback",
     "SceneIndex": "index",
     "SceneSpec": "spec",
@@ -13,7 +14,8 @@ _PUBLIC = {
     "compile_physics": "build",
     "compile_scene": "build",
     "frames": "render",
-    "side_by_side": "render",
+    "scene_camera": "camera",
+    "tiled": "panels",
     "to_xml": "build",
     "write_video": "video",
 }

@@ -1,7 +1,8 @@
-"""The bar above a picture: title and time, and below them what has been counted so far. Drawn by Pillow, crisp."""
+"""The bar above a picture: title and time, below them what has been counted so far. Drawn by Pillow, crisp."""
 
 import functools
 import importlib.util
+import math
 from pathlib import Path
 
 import numpy as np
@@ -15,39 +16,64 @@ RULE = (214, 218, 224)
 
 
 def bar_height(height: int) -> int:
-    """Rows of the bar in a picture of that many rows."""
-    return 2 * round(0.05 * height + 2)
+    """Rows of the bar in a picture of that many rows; in a small picture the words stay legible."""
+    return max(2 * round(0.05 * height + 2), min(36, height // 4))
 
 
 class Caption:
-    """Draws the bar; a line is drawn anew only when its words change."""
+    """Draws the bar; words are drawn anew only when they change, so in most pictures only the time is."""
 
     def __init__(self, *, title: str, width: int, bar: int) -> None:
         self.bar = bar
         self._width, self._title, self._pad = width, title, round(0.25 * self.bar)
-        self._line = functools.lru_cache(maxsize=64)(self._draw)
+        self._left = functools.lru_cache(maxsize=64)(self._draw_left)
+        self._right = functools.lru_cache(maxsize=64)(self._draw_right)
 
-    def paint(self, canvas: np.ndarray, *, time: str, counts: str, alarm: bool) -> None:
-        """Fills the first `bar` rows of `canvas`, uint8 (H, W, 3); `alarm` writes the counts in red."""
+    def paint(self, canvas: np.ndarray, *, time: str, counts: str, note: str = "", alarm: bool = False) -> None:
+        """Fills the first `bar` rows of `canvas`, uint8 (H, W, 3); `alarm` writes the counts in red.
+
+        Args:
+          canvas: the whole picture.
+          time: right of the title.
+          counts: second line.
+          note: at the right of the second line.
+          alarm: whether somebody touches something.
+        """
         half = (self.bar - 2) // 2
-        canvas[:half] = self._line(self._title, time, half, True, False)
-        canvas[half : self.bar - 2] = self._line(counts, "", self.bar - 2 - half, False, alarm)
+        self._line(canvas[:half], self._title, time, TEXT, True)
+        self._line(canvas[half : self.bar - 2], counts, note, ALARM if alarm else MUTED, False)
         canvas[self.bar - 2 : self.bar] = RULE
 
-    def _draw(self, left: str, right: str, rows: int, strong: bool, alarm: bool) -> np.ndarray:
+    def _line(self, canvas: np.ndarray, left: str, right: str, color: tuple[int, int, int], strong: bool) -> None:
+        rows, end = len(canvas), self._width - self._pad
+        words = self._right(right, rows, strong)
+        room = end - self._pad - (words.shape[1] + self._pad // 2 if right else 0)
+        canvas[:] = self._left(left, rows, room, color, strong)
+        canvas[:, max(end - words.shape[1], 0) : end] = words[:, -end:]
+
+    def _draw_left(self, text: str, rows: int, room: int, color: tuple[int, int, int], strong: bool) -> np.ndarray:
         image = Image.new("RGB", (self._width, rows), PAPER)
-        draw = ImageDraw.Draw(image)
-        plain = _font(False, (0.70 if strong else 0.66) * rows)
-        middle = (0.58 if strong else 0.44) * rows
-        room = self._width - 2 * self._pad - (plain.getlength(right) + self._pad if right else 0.0)
-        color = ALARM if alarm else TEXT if strong else MUTED
-        for size in (0.72, 0.64, 0.56):  # a long title is first set smaller, then cut
+        for size in (0.72, 0.64, 0.56):  # a long text is first set smaller, then cut
             font = _font(strong, size * rows)
-            if font.getlength(left) <= room:
+            if font.getlength(text) <= room:
                 break
-        draw.text((self._pad, middle), _shortened(left, font, room), fill=color, font=font, anchor="lm")
-        draw.text((self._width - self._pad, middle), right, fill=TEXT, font=plain, anchor="rm")
+        place = self._pad, _middle(rows, strong)
+        ImageDraw.Draw(image).text(place, _shortened(text, font, room), fill=color, font=font, anchor="lm")
         return np.asarray(image)
+
+    def _draw_right(self, text: str, rows: int, strong: bool) -> np.ndarray:
+        font = _font(False, (0.70 if strong else 0.62) * rows)
+        # Widths come in steps, so that the text on the left seldom gets another room.
+        width = rows * math.ceil(font.getlength(text) / rows)
+        image = Image.new("RGB", (width, rows), PAPER)
+        color = TEXT if strong else MUTED
+        ImageDraw.Draw(image).text((width, _middle(rows, strong)), text, fill=color, font=font, anchor="rm")
+        return np.asarray(image)
+
+
+def _middle(rows: int, strong: bool) -> float:
+    """Where the middle of a line's words is [rows]: the first line hangs, the second stands close below it."""
+    return (0.58 if strong else 0.44) * rows
 
 
 def _shortened(text: str, font: ImageFont.FreeTypeFont, room: float | int) -> str:

@@ -44,10 +44,15 @@ class Stamp:
     cover: np.ndarray
     color: np.ndarray
 
-    def press(self, canvas: np.ndarray) -> None:
-        """Blends into `canvas`, contiguous uint8 (H, W, 3)."""
+    def press(self, canvas: np.ndarray, *, brighter: int = 0) -> None:
+        """Blends into those pixels of `canvas`, contiguous uint8 (H, W, 3), whose channels all are at least `brighter`:
+        what lies on a bright floor passes below dark bodies."""
         flat = canvas.reshape(-1, 3)
         below = flat[self.pixel]
+        if brighter:
+            keep = below.min(axis=1) >= brighter
+            Stamp(self.pixel[keep], self.cover[keep], self.color[keep]).press(canvas)
+            return
         flat[self.pixel] = (below + self.cover[:, None] * (self.color - below) + 0.5).astype(np.uint8)
 
 
@@ -88,7 +93,7 @@ class Paths:
     """Trajectories as dots one pixel apart, in order of time, so that a stretch of time is a slice."""
 
     xy: np.ndarray
-    """(P, 2) [pixels]."""
+    """(P, 2), in the unit of the trajectories."""
     time: np.ndarray
     """(P,) [rows]."""
     agent: np.ndarray
@@ -99,13 +104,20 @@ class Paths:
     """(T,): the first dot of the segment that begins at each row."""
 
     @classmethod
-    def of(cls, xy: np.ndarray, present: np.ndarray) -> "Paths":
-        """Lays dots along xy (T, N, 2) [pixels], where an agent is present at both ends of a segment; (T, N) bool."""
+    def of(cls, xy: np.ndarray, pixels: np.ndarray, present: np.ndarray) -> "Paths":
+        """Lays dots along xy (T, N, 2), where an agent is present at both ends of a segment.
+
+        Args:
+          xy: the trajectories, in any unit.
+          pixels: the same in a picture, (T, N, 2) [pixels]: says how far apart the dots are.
+          present: bool (T, N).
+        """
         rows, agents, _ = xy.shape
-        usable = present & np.isfinite(xy).all(-1)
-        step = np.where((usable[1:] & usable[:-1])[..., None], np.diff(xy, axis=0), 0.0)
-        length = np.hypot(step[..., 0], step[..., 1])
-        count = np.where(usable[1:] & usable[:-1], np.clip(np.ceil(length), 1, 4096), 0).astype(int)
+        usable = present & np.isfinite(pixels).all(-1)
+        drawn = (usable[1:] & usable[:-1])[..., None]
+        step = np.where(drawn, np.diff(xy, axis=0), 0.0)
+        length = np.hypot(*np.moveaxis(np.where(drawn, np.diff(pixels, axis=0), 0.0), -1, 0))
+        count = np.where(drawn[..., 0], np.clip(np.ceil(length), 1, 4096), 0).astype(int)
         segment = np.repeat(np.arange(count.size), count.ravel())
         first = np.concatenate([[0], np.cumsum(count.ravel())])
         part = (np.arange(len(segment)) - first[segment]) / count.ravel()[segment]

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from swarm_mjcf.camera import scene_camera
 from swarm_mjcf.playback import Playback
-from swarm_mjcf.render import check_gl, frames, scene_view
+from swarm_mjcf.render import check_gl, frames, picture_height
 from swarm_mjcf.spec import SceneSpec
 
 
@@ -46,9 +47,9 @@ def _plain(spec: SceneSpec, playback: Playback, size: int) -> Iterator[None]:
     from swarm_mjcf.overlay import agent_colors
     from swarm_mjcf.scene_gl import MujocoPainter
 
-    view = scene_view(spec, playback, camera="top", width=size, height=size)
-    painter = MujocoPainter(spec, playback, view=view, quality="default")
-    colors, canvas = agent_colors(spec.num_agents), np.empty((view.height, view.width, 3), np.uint8)
+    camera = scene_camera(spec, [playback], camera="top", width=size, height=picture_height(size))
+    painter = MujocoPainter(spec, playback, camera=camera, quality="default")
+    colors, canvas = agent_colors(spec.num_agents), np.empty((camera.height, camera.width, 3), np.uint8)
     try:
         for row in range(len(playback.position)):
             painter.paint(canvas, row, colors)

@@ -7,10 +7,11 @@ import numpy as np
 
 from swarm_mjcf import gl, names
 from swarm_mjcf.build import compile_scene
+from swarm_mjcf.camera import Camera
 from swarm_mjcf.index import SceneIndex
 from swarm_mjcf.playback import Playback
 from swarm_mjcf.spec import SceneSpec
-from swarm_mjcf.view import DISC_TOP, FOVY, View
+from swarm_mjcf.view import DISC_TOP, FOVY
 
 
 class MujocoPainter:
@@ -20,39 +21,37 @@ class MujocoPainter:
     outlines around them) or "default", which is what `mujoco.Renderer` draws when nothing is set.
     """
 
-    def __init__(self, spec: SceneSpec, playback: Playback, *, view: View, quality: str) -> None:
-        count, solids = playback.position.shape[1], len(playback.obstacle)
+    def __init__(self, spec: SceneSpec, playback: Playback, *, camera: Camera, quality: str) -> None:
+        count, solids = playback.position.shape[1], playback.obstacle.shape[1]
         scene = replace(
             spec, num_agents=count, num_obstacles=solids, goal=playback.goal is not None, contacts=False, substeps=1
         )
         self._model = model = compile_scene(scene)
         self._data = data = mujoco.MjData(model)
-        self._playback, index = playback, SceneIndex.of(model, scene)
+        self._playback, self._views, index = playback, camera, SceneIndex.of(model, scene)
         self._qpos = np.arange(model.nq)[index.qpos].reshape(count, 2)
         self._discs = np.array([model.geom(names.disc(names.agent(i))).id for i in range(count)])
-        model.vis.global_.offwidth, model.vis.global_.offheight = view.width, view.height
+        model.vis.global_.offwidth, model.vis.global_.offheight = camera.width, camera.height
         model.vis.global_.fovy = FOVY
         _set_quality(model, quality)
 
-        for k, row in enumerate(np.arange(model.nmocap)[index.obstacle_mocap]):
-            model.geom_rgba[model.geom(names.disc(names.obstacle(k))).id, 3] = playback.obstacle_present[k]
-            data.mocap_pos[row, :2] = playback.obstacle[k] if playback.obstacle_present[k] else 0.0
+        self._solids = np.arange(model.nmocap)[index.obstacle_mocap]
+        self._solid_discs = [model.geom(names.disc(names.obstacle(k))).id for k in range(solids)]
         if playback.goal is not None:
             data.mocap_pos[index.goal_mocap, :2] = playback.goal
         mujoco.mj_forward(model, data)
 
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        self._camera.lookat[:] = (*view.center, 0.0)
-        self._camera.distance, self._camera.azimuth, self._camera.elevation = view.distance, 90.0, view.elevation
+        self._camera.azimuth, self._camera.elevation = 90.0, camera.elevation
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
         if quality == "fast":
             for flag in ("SHADOW", "REFLECTION", "SKYBOX", "HAZE", "FOG"):
                 self._scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = False
-        self._pixels = np.empty((view.height, view.width, 3), np.uint8)
-        self._rectangle = mujoco.MjrRect(0, 0, view.width, view.height)
-        self._context = gl.new_context(view.width, view.height)
+        self._pixels = np.empty((camera.height, camera.width, 3), np.uint8)
+        self._rectangle = mujoco.MjrRect(0, 0, camera.width, camera.height)
+        self._context = gl.new_context(camera.width, camera.height)
         try:
             self._context.make_current()
             self._drawer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -64,6 +63,10 @@ class MujocoPainter:
     def paint(self, canvas: np.ndarray, row: int, colors: np.ndarray) -> None:
         """Fills `canvas`, uint8 (height, width, 3), with row `row`; colors (N, 3) in 0..255."""
         model, data, present = self._model, self._data, self._playback.agent_present[row]
+        view, standing = self._views.at(row), self._playback.obstacle_present[row]
+        self._camera.lookat[:2], self._camera.distance = view.center, view.distance
+        data.mocap_pos[self._solids[standing], :2] = self._playback.obstacle[row, standing]
+        model.geom_rgba[self._solid_discs, 3] = standing
         data.qpos[self._qpos[present]] = self._playback.position[row, present]
         model.geom_rgba[self._discs, :3] = colors / 255
         model.geom_rgba[self._discs, 3] = present  # MuJoCo leaves out what is wholly transparent

@@ -47,7 +47,7 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
         if first is None:
             raise VideoError(f"{target}: there is no frame to write")
         even = (_even(frame, target, first.shape) for frame in itertools.chain([first], stream))
-        with _Unfinished(target) as part:
+        with Unfinished(target) as part:
             (_write_gif if target.suffix.lower() == ".gif" else _write_mp4)(part, even, fps)
     finally:
         if isinstance(stream, Iterator) and hasattr(stream, "close"):
@@ -86,12 +86,12 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float | int) -> No
     done = False
     try:
         for frame in itertools.chain([first], stream):
-            with _refused(path):
+            with refused(path):
                 writer.add_image(frame)
         done = True
     finally:
         try:
-            with _refused(path):
+            with refused(path):
                 writer.close()
         except VideoError:
             if done:  # otherwise what broke the loop is the news
@@ -108,7 +108,7 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float | int) -> No
     first = next(pictures)
     # The format counts hundredths of a second, and browsers slow down anything below two.
     duration = max(20, 10 * round(100 / fps))
-    with _refused(path), path.open("wb") as file:
+    with refused(path), path.open("wb") as file:
         first.save(file, format="GIF", save_all=True, append_images=pictures, duration=duration, loop=0)
 
 
@@ -121,7 +121,7 @@ def _even(frame: np.ndarray, target: Path, shape: tuple[int, ...]) -> np.ndarray
     return np.pad(frame, ((0, odd[0]), (0, odd[1]), (0, 0)), mode="edge") if any(odd) else frame
 
 
-class _Unfinished:
+class Unfinished:
     """A path beside the target to write to: renamed on success, deleted otherwise."""
 
     def __init__(self, target: Path) -> None:
@@ -129,7 +129,7 @@ class _Unfinished:
         self._part = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
 
     def __enter__(self) -> Path:
-        with _refused(self._target):
+        with refused(self._target):
             self._target.parent.mkdir(parents=True, exist_ok=True)
             self._part.touch()
         return self._part
@@ -137,14 +137,14 @@ class _Unfinished:
     def __exit__(self, kind: object, *_: object) -> None:
         try:
             if kind is None:
-                with _refused(self._target):
+                with refused(self._target):
                     self._part.replace(self._target)
         finally:
             with suppress(OSError):
                 self._part.unlink(missing_ok=True)
 
 
-class _refused:
+class refused:
     """Turns what the system or ffmpeg says into one line that names the file."""
 
     def __init__(self, path: Path) -> None:

@@ -1,6 +1,7 @@
 """Where the camera stands and where a point of the scene falls in the picture; the same for every renderer."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,9 +48,9 @@ class View:
         return np.stack([column, row], axis=-1)
 
 
-def fit_view(spec: SceneSpec, playback: Playback, *, camera: str, width: int, height: int) -> View:
-    """The closest constant view that shows all agents at all times, the obstacles and the goal, with a margin."""
-    points = _extremes(spec, playback)
+def fit_view(spec: SceneSpec, shown: Sequence[Playback], *, camera: str, width: int, height: int) -> View:
+    """The closest constant view of all runs: all agents at all times, the obstacles and the goals, with a margin."""
+    points = np.concatenate([_extremes(spec, playback) for playback in shown])
     low, high = points.min(axis=0), points.max(axis=0)
     half = np.maximum((high - low) / 2, 6 * spec.agent_radius)
     middle = (low + high) / 2

@@ -16,10 +16,12 @@ from swarm_mjcf.errors import SpecError, SwarmError
 from swarm_mjcf.overlay import CONTACT
 from swarm_mjcf.playback import onsets
 from swarm_mjcf.video import ffmpeg_problem
-from swarmnet.videos import MIN_FPS, find_videos, make_video, make_videos, playback, scene_spec, timing
+from swarmnet.cli import main
+from swarmnet.film import MIN_FPS, Look, Panel, film, playback, scene_spec, timing
+from swarmnet.videos import find_videos, make_video, make_videos
 
 needs_ffmpeg = pytest.mark.skipif(ffmpeg_problem() is not None, reason=f"ffmpeg: {ffmpeg_problem()}")
-SMALL = {"size": 96, "renderer": "matplotlib"}
+SMALL = Look(size=96, renderer="matplotlib")
 
 
 def pictures(path) -> list[np.ndarray]:
@@ -60,7 +62,19 @@ def test_positions_are_interpolated_and_contacts_are_not() -> None:
     # The second agent's last row is 3; nothing is drawn on its way to the zeros of masked rows.
     np.testing.assert_array_equal(np.flatnonzero(shown.agent_present[:, 1]), np.arange(13))
     np.testing.assert_array_equal(shown.goal, [30, 0])
-    np.testing.assert_array_equal(shown.obstacle, [[10, 12]])
+    np.testing.assert_array_equal(shown.obstacle, np.broadcast_to([[10, 12]], (21, 1, 2)))
+
+
+def test_obstacles_move_like_agents_and_come_and_go() -> None:
+    data = scenes()
+    data.position[0, :, 1] = np.array([10, 12]) + 2 * np.arange(6)[:, None]
+    data.mask[0, 4:, 1] = False
+    data.depth[0, 2, 2] = 0.25
+    shown = playback(data, 0, "x", between=2)
+    np.testing.assert_allclose(shown.obstacle[:, 0], np.array([10, 12]) + np.arange(11)[:, None])
+    np.testing.assert_array_equal(np.flatnonzero(shown.obstacle_present[:, 0]), np.arange(7))
+    assert shown.depth is not None
+    np.testing.assert_array_equal(np.flatnonzero(shown.depth[:, 0]), [3, 4])  # the pictures of the step to row 2
 
 
 def test_contacts_of_successive_steps_stay_one_event() -> None:
@@ -80,7 +94,7 @@ def test_the_scene_is_the_recorded_one_or_has_its_radii() -> None:
 
 
 def test_a_video_has_its_pictures_and_its_contacts(pair, tmp_path) -> None:
-    out = make_video(pair[0], tmp_path / "one.gif", scene=1, speed=2.0, **SMALL)
+    out = make_video(pair[:1], tmp_path / "one.gif", scenes=[1], look=SMALL)
     pace = timing(0.5, 2.0)
     drawn = pictures(out)
     assert len(drawn) == 5 * pace.between + 1
@@ -96,35 +110,104 @@ def test_a_video_has_its_pictures_and_its_contacts(pair, tmp_path) -> None:
 def test_side_by_side_as_mp4(pair, tmp_path) -> None:
     import imageio_ffmpeg
 
-    out = make_video(pair[0], tmp_path / "both.mp4", beside=pair[1], camera="tilted", **SMALL)
+    told = []
+    out = make_video(
+        pair,
+        tmp_path / "both.mp4",
+        look=replace(SMALL, camera="tilted"),
+        progress=lambda done, total, note: told.append((done, total)),
+    )
     program = imageio_ffmpeg.get_ffmpeg_exe()
     read = subprocess.run([program, "-i", out, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True)
-    assert len(read.stdout) == (5 * timing(0.5, 2.0).between + 1) * 96 * (2 * 96 + 4) * 3
+    count = 5 * timing(0.5, 2.0).between + 1
+    assert len(read.stdout) == count * 96 * (2 * 96 + 4) * 3
+    assert told == [(number + 1, count) for number in range(count)]
 
 
-def test_what_cannot_be_shown_is_said(pair, tmp_path) -> None:
+def test_compared_recordings_share_a_view_and_scenes_of_one_file_do_not() -> None:
+    """The agents of the second recording end elsewhere; what stands still has one place in both pictures."""
+    one, other = scenes(count=1), scenes(count=1)
+    other.position[0, 1:, 3, 1] = 60
+    two = [Panel(one, "a"), Panel(other, "b", one, "a")]
+    shared, own = (
+        next(film(two, replace(SMALL, contacts=False), columns=2, one_view=view).pictures).astype(int)
+        for view in (True, False)
+    )
+    left, right = shared[45:, :96], shared[45:, 100:]
+    grey = [np.argwhere(np.abs(part - [140, 145, 153]).max(-1) < 6).mean(axis=0) for part in (left, right)]
+    np.testing.assert_allclose(grey[0], grey[1], atol=1)
+    part = own[45:, :96], own[45:, 100:]
+    grey = [np.argwhere(np.abs(picture - [140, 145, 153]).max(-1) < 6).mean(axis=0) for picture in part]
+    assert np.abs(grey[0] - grey[1]).max() > 3
+
+
+def test_many_panels_are_smaller_and_too_many_are_refused() -> None:
+    panels = [Panel(scenes(count=1), "x")] * 9
+    first = next(film(panels, Look(renderer="matplotlib"), columns=3).pictures)
+    assert first.shape == (3 * 484 - 4, 3 * 484 - 4, 3)
+    assert next(film(panels[:5], Look(renderer="matplotlib"), columns=5).pictures).shape == (288, 5 * 292 - 4, 3)
+    with pytest.raises(SpecError, match="size: 600 was given, allowed is at most 451 pixels"):
+        film(panels, Look(size=600), columns=9)
+
+
+def test_what_cannot_be_shown_leaves_no_file(pair, tmp_path) -> None:
     out = tmp_path / "x.gif"
-    with pytest.raises(SwarmError, match=r"there is no scene 2; it holds 2 scenes, 0 to 1"):
-        make_video(pair[0], out, scene=2, **SMALL)
-    with pytest.raises(SwarmError, match="there is no scene -1"):
-        make_video(pair[0], out, scene=-1, **SMALL)
     with pytest.raises(SwarmError, match="does not exist"):
-        make_video(tmp_path / "none.h5", out, **SMALL)
+        make_video([tmp_path / "none.h5"], out, look=SMALL)
     with pytest.raises(SpecError, match="speed"):
-        make_video(pair[0], out, speed=0.0, **SMALL)
-    save(tmp_path / "moved.h5", scenes(shift=2.0))
-    save(tmp_path / "slower.h5", replace(scenes(), dt=0.25))
-    for name, said in (("moved", "other starts"), ("slower", r"dt 0\.5 s in one and 0\.25 s")):
-        with pytest.raises(SwarmError, match=f"do not hold the same scenes.*{said}"):
-            make_video(pair[0], out, beside=tmp_path / f"{name}.h5", **SMALL)
-    assert not out.exists()
+        make_video(pair, out, look=replace(SMALL, speed=0.0))
+    with pytest.raises(SpecError, match="camera"):
+        make_video(pair, out, look=replace(SMALL, camera="inside"))
+    with pytest.raises(SpecError, match="size: 8 was given, allowed is at least 64"):
+        make_video(pair, out, look=replace(SMALL, size=8))
+    with pytest.raises(SpecError, match="ends in"):
+        make_video(pair, tmp_path / "x.avi", look=SMALL)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["expert.h5", "learned.h5"]
 
 
-def test_shorter_recordings_stay_on_their_last_picture(pair, tmp_path) -> None:
-    save(tmp_path / "short.h5", scenes(rows=4))
-    drawn = pictures(make_video(pair[0], tmp_path / "x.gif", beside=tmp_path / "short.h5", **SMALL))
-    assert len(drawn) == 5 * timing(0.5, 2.0).between + 1
-    assert np.abs(drawn[-1][:, 110:] - drawn[-2][:, 110:]).max() < 30  # quantised apart
+def test_an_interrupted_video_leaves_nothing(pair, tmp_path) -> None:
+    def interrupt(done: int, total: int, note: str) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_video(pair, tmp_path / "x.gif", look=SMALL, progress=interrupt)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["expert.h5", "learned.h5"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--camera", "follow", "--grid", "1x2", "--speed", "1"), (1, 2)),
+        (("--no-contacts", "--scene", "1"), (1, 1)),
+        (("--scene", "1", "0", "1"), (1, 3)),
+    ],
+)
+def test_the_command_writes_the_panels_it_was_asked_for(pair, tmp_path, capsys, arguments, said) -> None:
+    out = tmp_path / "new" / "x.gif"
+    assert (
+        main(["render", str(pair[0]), *arguments, "--size", "64", "--renderer", "matplotlib", "--out", str(out)]) == 0
+    )
+    assert capsys.readouterr().out.strip() == str(out)
+    rows, columns = said
+    with Image.open(out) as image:
+        assert image.size == (columns * 68 - 4, rows * 68 - 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--out", "x.avi"), "out: 'x.avi' was given"),
+        (("--out", "x.pdf", "--speed", "3"), "speed: 3.0 was given, allowed is nothing"),
+        (("--width", "page"), "width: 'page' was given, allowed is nothing"),
+    ],
+)
+def test_the_command_refuses_what_would_mean_nothing(pair, capsys, arguments, said) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["render", str(pair[0]), *arguments])
+    assert exit_.value.code == 2
+    captured = capsys.readouterr()
+    assert said in " ".join((captured.out + captured.err).replace("│", " ").split())
 
 
 def test_videos_of_a_run_are_made_once(tmp_path) -> None:
