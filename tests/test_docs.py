@@ -22,6 +22,17 @@ def test_the_guides_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     assert scope["recording"].position.shape == (64, 21, 5, 2)
 
 
+def test_the_code_of_the_interfaces_page_runs(capsys: pytest.CaptureFixture) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/interfaces.md").read_text(), re.DOTALL)
+    assert len(blocks) >= 6
+    scope: dict = {}
+    for block in blocks:
+        exec(compile(block, "docs/interfaces.md", "exec"), scope)
+    said = capsys.readouterr().out
+    assert f"(8, 4, {len(scope['core'].observation.labels)}) (8,) (8, 4)" in said
+    assert f"(4, {len(scope['core'].observation.labels)}) [" in said
+
+
 def test_the_results_page_is_rendered_from_the_committed_results() -> None:
     assert (ROOT / "docs/results.md").read_text() == render_page(ROOT / "docs/results")
 
@@ -30,6 +41,6 @@ def test_commands_that_the_documents_name_exist() -> None:
     from swarmnet.cli import _MODULES
 
     known = {kind.__name__.lower() for kind in _MODULES}
-    for path in (ROOT / "README.md", ROOT / "docs/guide.md", ROOT / "docs/results.md"):
+    for path in (ROOT / "README.md", ROOT / "docs/guide.md", ROOT / "docs/interfaces.md", ROOT / "docs/results.md"):
         named = set(re.findall(r"(?<![\w/])swarmnet ([a-z]+)", path.read_text()))
         assert named <= known | {"best", "thesis"}, path

@@ -1,5 +1,6 @@
 """`swarmnet bench`: prints `name.metric value` lines; what is compared is measured in the same run."""
 
+import math
 import re
 import tempfile
 import time
@@ -15,7 +16,9 @@ from gnn.evaluate import constant_velocity, persistence, prediction_error
 from gnn.train import train
 from swarm_mjcf.build import compile_scene
 from swarm_mjcf.spec import SceneSpec
+from swarmnet.bench_adapters import bench_adapters
 from swarmnet.bench_engines import bench_engines
+from swarmnet.bench_experts import bench_experts
 from swarmnet.bench_throughput import bench_throughput
 from swarmnet.commands.train import note
 from swarmnet.config import Bench
@@ -50,6 +53,40 @@ def _engines(config: Bench) -> Results:
     return Results(name="bench-engines", rows=rows)
 
 
+def _experts(config: Bench) -> Results:
+    rows = []
+    for cell in bench_experts(config.agents, repeats=config.repeats):
+        where = f"experts.{cell.expert}.{cell.interaction}.n{cell.agents}".replace(" ", "_")
+        figures = (
+            ("scene-steps/s", cell.per_second, "1/s"),
+            ("cost per agent relative to N=100", cell.cost_per_agent, "1"),
+            ("ratio to NumPy", cell.numpy_ratio, "1"),
+        )
+        for figure, value, unit in figures:
+            if math.isnan(value):
+                continue
+            print(f"{where}.{_metric(figure)} {value:.4g}", flush=True)
+            rows.append(Row(f"{cell.expert}, {cell.interaction}", f"N={cell.agents} {figure}", value, unit=unit))
+    return Results(name="bench-experts", rows=rows)
+
+
+def _adapters(config: Bench) -> Results:
+    rows = []
+    for cell in bench_adapters(turns=5 * config.repeats):
+        where = f"adapters.{cell.adapter}.{cell.policy}.s{cell.scenes}".replace(" ", "_")
+        for figure, value, unit in (
+            ("scene-steps/s", cell.per_second, "1/s"),
+            ("ratio to environment", cell.ratio, "1"),
+        ):
+            print(f"{where}.{_metric(figure)} {value:.4g}", flush=True)
+            rows.append(Row(f"{cell.adapter}, {cell.policy}", f"S={cell.scenes} {figure}", value, unit=unit))
+    return Results(name="bench-adapters", rows=rows)
+
+
+def _metric(figure: str) -> str:
+    return re.sub("[^a-z0-9]+", "_", figure.lower())
+
+
 def _throughput(config: Bench) -> Results:
     rows, device = [], jax.devices()[0]
     print(f"device: {device.device_kind}", flush=True)
@@ -67,7 +104,7 @@ def _throughput(config: Bench) -> Results:
             if value is None:
                 continue
             where = f"throughput.{cell.engine}.s{cell.scenes}.k{cell.substeps}"
-            print(f"{where}.{re.sub('[^a-z]+', '_', figure)} {value:.4g}", flush=True)
+            print(f"{where}.{_metric(figure)} {value:.4g}", flush=True)
             rows.append(Row(cell.engine, f"{column} {figure}", value, unit=unit))
     return Results(name="bench-throughput", rows=rows, seeds=[config.seed])
 
@@ -134,6 +171,8 @@ def _rendering(config: Bench) -> Results:
 
 _MEASURES = {
     "engines": _engines,
+    "experts": _experts,
+    "adapters": _adapters,
     "throughput": _throughput,
     "imitation": _imitation,
     "rendering": _rendering,
