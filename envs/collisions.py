@@ -5,31 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from envs.estimates import Bootstrap, Estimate
 from envs.trajectories import AGENT, GOAL, Trajectories
 
 NEAR_GOAL = 15.0
 """Contacts closer to the goal than this [m] are reported apart from those en route."""
-RESAMPLES = 1000
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A figure with its 95% bootstrap interval over scenes; extremes (deepest, closest) have none."""
-
-    value: float
-    low: float | None
-    high: float | None
-    unit: str
-
-    def __str__(self) -> str:
-        scale, unit = (100, "%") if self.unit == "share" else (1, self.unit)
-        if self.low is None or self.high is None:
-            return f"{self.value * scale:.3g} {unit}".strip()
-        return f"{self.value * scale:.3g} [{self.low * scale:.3g}, {self.high * scale:.3g}] {unit}".strip()
 
 
 def collision_report(trajectories: Trajectories, *, reach: float = NEAR_GOAL, seed: int = 0) -> dict[str, Estimate]:
-    """Figures over all scenes, by name.
+    """Figures over all scenes, by name; `docs/definitions.md` defines each in formulas.
 
     A contact step is a control step in which something touches at any of its substep states. Shares of steps are per
     scene ("any agent of the scene touches") unless the name says `agent_`. An event is an onset of contact of an agent;
@@ -43,7 +27,7 @@ def collision_report(trajectories: Trajectories, *, reach: float = NEAR_GOAL, se
     steps = present[:, 1:]
     with_agent, with_solid = (t.agent_contact[:, 1:] > 0) & steps, (t.solid_contact[:, 1:] > 0) & steps
     either = with_agent | with_solid
-    bootstrap = _Bootstrap(len(t), seed)
+    bootstrap = Bootstrap(len(t), seed)
     report: dict[str, Estimate] = {}
 
     def share(name: str, hits: np.ndarray, among: np.ndarray) -> None:
@@ -62,7 +46,7 @@ def collision_report(trajectories: Trajectories, *, reach: float = NEAR_GOAL, se
         report[f"events_per_trajectory_{name}"] = bootstrap.ratio(counts, np.ones(len(t)), "")
     deepest = float((t.depth * present).max(initial=0))
     report["deepest_penetration"] = Estimate(deepest, None, None, "m")
-    clearance = _clearance(t, present)
+    clearance = float(_clearance(t).min(initial=np.inf))
     report["minimum_clearance"] = Estimate(-deepest if deepest > 0 else clearance, None, None, "m")
     if (t.kind == GOAL).any():
         goal = t.position[np.arange(len(t)), :, np.argmax(t.kind == GOAL, axis=1)]  # (S, T, 2)
@@ -79,10 +63,35 @@ def collision_report(trajectories: Trajectories, *, reach: float = NEAR_GOAL, se
     return report
 
 
-def _clearance(t: Trajectories, present: np.ndarray) -> float:
-    """Smallest surface distance [m] at control steps between an agent and another agent or an obstacle."""
-    bodies = t.mask & (t.kind != GOAL)[:, None]
-    smallest = np.inf
+@dataclass(frozen=True)
+class WorstScene:
+    """A scene worth a look, and why."""
+
+    scene: int
+    contact_steps: int
+    """Control steps in which any of its agents touches something."""
+    deepest_penetration: float
+    """[m]"""
+    minimum_clearance: float
+    """Smallest distance between surfaces at control steps [m]; below 0 where they overlap at one."""
+
+
+def worst_scenes(trajectories: Trajectories, count: int) -> list[WorstScene]:
+    """Scenes with the most contact steps first; among equals the deepest penetration, then the smallest clearance."""
+    t = trajectories
+    present = t.mask & (t.kind == AGENT)[:, None]
+    touching = (((t.agent_contact > 0) | (t.solid_contact > 0)) & present)[:, 1:]
+    steps, deepest = touching.any(axis=2).sum(axis=1), (t.depth * present).max(axis=(1, 2), initial=0)
+    clearance = _clearance(t)
+    order = np.lexsort([clearance, -deepest, -steps])[:count]
+    return [WorstScene(int(i), int(steps[i]), float(deepest[i]), float(clearance[i])) for i in order]
+
+
+def _clearance(t: Trajectories) -> Float[np.ndarray, " S"]:
+    """Smallest surface distance [m] of each scene at control steps between an agent and another agent or an obstacle;
+    infinite where an agent is alone."""
+    bodies, present = t.mask & (t.kind != GOAL)[:, None], t.mask & (t.kind == AGENT)[:, None]
+    smallest = np.full(len(t), np.inf)
     for node in range(t.position.shape[2]):
         if not (t.kind[:, node] == AGENT).any():
             continue
@@ -90,23 +99,5 @@ def _clearance(t: Trajectories, present: np.ndarray) -> float:
         apart -= (t.radius + t.radius[:, node : node + 1])[:, None]
         other = bodies & present[:, :, node : node + 1]
         other[:, :, node] = False
-        smallest = min(smallest, float(np.min(apart, where=other, initial=np.inf)))
+        smallest = np.minimum(smallest, np.min(apart, axis=(1, 2), where=other, initial=np.inf))
     return smallest
-
-
-class _Bootstrap:
-    """Percentile bootstrap over scenes, the same resamples for every figure."""
-
-    def __init__(self, scenes: int, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        self.weights: Float[np.ndarray, "B S"] = rng.multinomial(scenes, np.full(scenes, 1 / scenes), size=RESAMPLES)
-
-    def ratio(self, top: np.ndarray, bottom: np.ndarray, unit: str) -> Estimate:
-        """Sum of `top` over sum of `bottom`, both per scene; NaN when there is nothing to divide by."""
-        top, bottom = np.asarray(top, float), np.asarray(bottom, float)
-        if not bottom.sum():
-            return Estimate(float("nan"), None, None, unit)
-        below = self.weights @ bottom
-        samples = (self.weights @ top)[below > 0] / below[below > 0]
-        low, high = np.quantile(samples, [0.025, 0.975])
-        return Estimate(float(top.sum() / bottom.sum()), float(low), float(high), unit)

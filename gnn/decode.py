@@ -62,7 +62,7 @@ def make_predict(config: ModelConfig, scales: Scales, integrator: Integrator) ->
         here = graph.present[:, first:, None]
         after = jnp.concatenate(free_flight(position, velocity, jnp.where(here, out, 0), integrator), axis=-1)
         # Goals stand still, obstacles keep their velocity: neither is steered.
-        context = last[:, :first].at[..., :2].add(last[:, :first, 2:] * integrator.dt)
+        context = jnp.asarray(last[:, :first]).at[..., :2].add(last[:, :first, 2:] * integrator.dt)
         return jnp.concatenate([context, jnp.where(here, after, last[:, first:])], axis=1)
 
     def predict(params: Params, history: Array, graph: Graph, *, horizon: int) -> Float[Array, "B h V 4"]:

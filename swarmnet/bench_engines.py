@@ -13,7 +13,7 @@ from envs.config import clear
 from envs.dynamics import limited
 from envs.engines import make_engine
 from envs.engines.engine import Engine
-from envs.experts.boids import boids
+from envs.experts.registry import make_expert
 from envs.state import State, make_state
 from gnn.config import model_preset
 from gnn.decode import make_policy
@@ -108,7 +108,7 @@ def bench_engines(agents: tuple[int, ...], substeps: tuple[int, ...], *, repeats
             scenes = int(np.clip(20480 // count, 16, 2048))
             start = _start(spec, scenes)
             native = make_engine(spec, "native")
-            expert = boids(replace(clear().expert, arena=spec.arena))
+            expert = make_expert(replace(clear().expert, arena=spec.arena))
             yield from _case(
                 {
                     "bare": _bare(spec, start),

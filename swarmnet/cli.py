@@ -11,10 +11,24 @@ from typing import Annotated, Any, Union
 import tyro
 
 from swarm_mjcf.errors import SwarmError
-from swarmnet.config import Bench, Command, Demo, Doctor, Evaluate, Render, Report, Simulate, Train
+from swarmnet.config import (
+    Bench,
+    Command,
+    Demo,
+    Doctor,
+    Evaluate,
+    Export,
+    Import,
+    Merge,
+    Render,
+    Report,
+    Simulate,
+    Train,
+)
 
 _MODULES: dict[type, str] = {
     Simulate: "swarmnet.commands.simulate",
+    Merge: "swarmnet.commands.merge",
     Train: "swarmnet.commands.train",
     Evaluate: "swarmnet.commands.evaluate",
     Render: "swarmnet.commands.render",
@@ -22,8 +36,14 @@ _MODULES: dict[type, str] = {
     Report: "swarmnet.commands.report",
     Doctor: "swarmnet.commands.doctor",
     Bench: "swarmnet.commands.bench",
+    Import: "swarmnet.commands.import_",
+    Export: "swarmnet.commands.export",
 }
 """Each has a function `run(config) -> int`, the exit code."""
+
+
+# A positional argument that may be left out; configurations are standard library only and cannot say so themselves.
+Evaluate.__annotations__["run"] = tyro.conf.Positional[Evaluate.__annotations__["run"]]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -5,7 +5,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from envs.config import SimulateConfig
+from envs.importers.config import ImportConfig
+from envs.shards import Shard
 from gnn.config import TrainConfig
+from swarm_mjcf.errors import SpecError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,12 +16,41 @@ class Simulate(SimulateConfig):
     """Simulate scenes with an expert in MuJoCo and record them.
 
     Writes one HDF5 file (positions, velocities, masks, contacts, provenance), whole or not at all. Chunks that are done
-    are kept beside it until then: an interrupted call goes on where it was.
+    are kept beside it until then: an interrupted call goes on where it was. Machines can share the work: with --shard
+    each writes its part, and `swarmnet merge` makes of them the file that one call would have written.
 
     Example:
       swarmnet simulate --preset clear --scenes 2000 --seed 0 --out runs/clear.h5
+      swarmnet simulate --start corridor --num-obstacles 6 --rules separation obstacle goal --out runs/corridor.h5
+      swarmnet simulate --scenes 100000 --shard 2/4 --out runs/big.h5
+      swarmnet simulate --num-agents 10 --export-xml scene.xml
     """
 
+    out: Path = Path("runs/trajectories.h5")
+    """File to write; shard 2 of 4 of NAME.h5 goes to NAME.shard-2-of-4.h5."""
+    shard: str = "1/1"
+    """i/n: compute only the i-th of n parts (1 <= i <= n)."""
+    export_xml: Path | None = None
+    """Write the world's MJCF here, for MuJoCo's own tools, and simulate nothing."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        Shard.parse(self.shard)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Merge:
+    """Join the shards of one simulation, in any order, into the file that one call would have written, to the byte.
+
+    Every part is checked against its checksums. Parts of other settings or versions, parts given twice and missing ones
+    are refused by name.
+
+    Example:
+      swarmnet merge runs/big.shard-*.h5 --out runs/big.h5
+    """
+
+    parts: tuple[Path, ...]
+    """Files written by `swarmnet simulate --shard`."""
     out: Path = Path("runs/trajectories.h5")
     """File to write."""
 
@@ -45,58 +77,108 @@ class Train(TrainConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Judge a trained model on scenes it has never seen: prediction error by horizon, and closed loop in physics.
+    """Judge any policy on scenes it has never seen, beside a reference: contacts, collective motion, worst scenes.
 
-    The prediction table has persistence and constant velocity beside the model. In closed loop the model steers the
-    agents in MuJoCo from the same starts as the expert; contacts are counted by the engine. Both are recorded in
-    RUN/rollouts/, figures and report.html are renewed.
+    A policy is a run folder with a trained model, an expert by name, a Python function module:function, or a file of
+    recorded trajectories, whose contacts are computed by replaying the positions. Policy and reference steer the agents
+    in MuJoCo from the same starts; contacts are counted by the engine. A model's prediction error is measured, too,
+    with persistence and constant velocity beside it. RUN gets rollouts/, figures/, videos/, the contact log,
+    evaluation.json and report.html.
+
+    A function is called as function(state, params, key) and returns accelerations (scenes, agents, 2) [m/s^2];
+    module:make() calls make first, for a policy with settings. Modules of the working folder are found.
 
     Example:
       swarmnet evaluate runs/clear --scenes 200 --json evaluation.json
+      swarmnet evaluate --policy helbing --preset clear
+      swarmnet evaluate runs/mine --policy mymodule:policy --reference runs/clear
+      swarmnet evaluate --policy recorded.h5 --log parquet
     """
 
-    run: Path
-    """Run folder with a trained model."""
+    run: Path | None = None
+    """Run folder: its trained model is judged unless --policy names another, and results are written there. Without it
+    they go to runs/evaluate-POLICY."""
+    policy: str | None = None
+    """What to judge: a run folder, expert (the world's own) or an expert's name, module:function, or a .h5 file."""
+    reference: str = "expert"
+    """What to judge it by, named in the same way; none for nothing."""
     scenes: int = 200
-    """Unseen scenes, drawn from `seed`."""
+    """Unseen scenes, drawn from `seed`; of recorded trajectories, all."""
     steps: int = 50
-    """Control steps per scene."""
+    """Control steps per scene; of recorded trajectories, all."""
     seed: int = 1_000_000
     """Seed of the unseen scenes; must differ from the training data's."""
     preset: str | None = None
-    """World to judge in; the training data's own by default."""
+    """World to judge in; by default that of a model's training data or of a recording, else clear."""
+    num_agents: int | None = None
+    """Largest number of agents per scene; the world's own by default."""
+    num_obstacles: int | None = None
+    """Largest number of obstacles per scene; the world's own by default."""
     engine: str = "auto"
     """Physics engine: auto, native, mjx."""
+    log: Literal["csv", "parquet"] = "csv"
+    """Format of the contact log."""
+    videos: int = 3
+    """Worst scenes to make videos of."""
     json: Path | None = None
     """Also write the results here, machine-readable."""
 
 
+SHEETS, VIDEOS = (".pdf", ".png", ".svg"), (".mp4", ".gif")
+"""Endings of what `swarmnet render` writes."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Make a video of recorded scenes, or of two recordings of the same scenes side by side.
+    """Make a video, or a still sheet for a paper, of recorded scenes.
 
-    Needs no display. Without EGL a matplotlib renderer draws, and the message names the package to install.
+    One file: one scene, or many in a grid. Two to four files are compared: the same scene as each recorded it, the
+    first dashed in the others. The ending of --out says what is written: .mp4 and .gif are videos, .pdf, .png and .svg
+    are sheets of trajectories with axes in metres. Needs no display: without EGL a matplotlib renderer draws, and the
+    message names the package to install.
 
     Example:
-      swarmnet render runs/demo/rollouts/expert.h5 --beside runs/demo/rollouts/learned.h5 --scene 3
+      swarmnet render runs/demo/rollouts/expert.h5 runs/demo/rollouts/learned.h5 --scene 3
+      swarmnet render runs/clear.h5 --grid 3x3 --camera follow --speed 1 --out grid.mp4
+      swarmnet render runs/clear.h5 --scene 0 7 12 --width page --color time --out figure.pdf
     """
 
-    data: Path
-    """Trajectories to show."""
-    beside: Path | None = None
-    """Other trajectories of the same scenes, shown on the right."""
-    scene: int = 0
-    """Which scene of the file."""
-    camera: Literal["top", "tilted"] = "top"
-    """View from above, or tilted."""
-    size: int = 480
-    """Height and width of a frame [pixels]."""
-    renderer: Literal["auto", "mujoco", "matplotlib"] = "auto"
-    """MuJoCo (OpenGL) or matplotlib; auto takes MuJoCo where it works."""
+    data: tuple[Path, ...]
+    """Trajectories to show: 1 file, or 2 to 4 of the same scenes."""
+    scene: tuple[int, ...] = (0,)
+    """Scenes to show; with --grid, the first of them."""
+    grid: str | None = None
+    """Panels as ROWSxCOLUMNS; a grid of one file is filled with scenes from --scene on."""
+    titles: tuple[str, ...] = ()
+    """Names above the panels, one per file; what the files say of themselves by default."""
+    contacts: bool = True
+    """Show contacts: red agents, crosses that stay, counts and depth."""
+    camera: Literal["top", "tilted", "follow"] = "top"
+    """Videos: from above, tilted, or from above and staying with the swarm."""
     speed: float = 2.0
-    """Seconds of simulation per second of video."""
+    """Videos: seconds of simulation per second of video; 1 is real time."""
+    size: int | None = None
+    """Videos: height and width of a panel [pixels]; 480 by default, less in a wide grid."""
+    renderer: Literal["auto", "mujoco", "matplotlib"] = "auto"
+    """Videos: MuJoCo (OpenGL) or matplotlib; auto takes MuJoCo where it works."""
+    width: Literal["column", "page"] = "column"
+    """Sheets: 3.4 or 7 inches wide."""
+    color: Literal["agent", "time"] = "agent"
+    """Sheets: what the colours of the trajectories tell."""
     out: Path = Path("video.mp4")
-    """File to write: .mp4, or .gif."""
+    """File to write: .mp4, .gif, .pdf, .png or .svg."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.data) <= 4:
+            raise SpecError("data", f"{len(self.data)} files", "1 to 4 files of trajectories to show")
+        ending = self.out.suffix.lower()
+        if ending not in VIDEOS + SHEETS:
+            raise SpecError("out", str(self.out), f"a name that ends in {', '.join(VIDEOS + SHEETS)}")
+        foreign = ("camera", "speed", "size", "renderer") if ending in SHEETS else ("width", "color")
+        kind = f"a sheet ({ending})" if ending in SHEETS else f"a video ({ending})"
+        for field in fields(self):
+            if field.name in foreign and getattr(self, field.name) != field.default:
+                raise SpecError(field.name, getattr(self, field.name), f"nothing: it means nothing for {kind}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +255,7 @@ class Bench:
     what: Literal["engines", "experts", "adapters", "throughput", "imitation", "rendering", "build"]
     """What to measure."""
     agents: tuple[int, ...] = (5, 10, 20, 100, 1000)
-    """engines: numbers of agents, each with 1 obstacle."""
+    """engines, experts: numbers of agents, each with 1 obstacle."""
     substeps: tuple[int, ...] = (1, 15)
     """engines, throughput: physics steps per control step."""
     repeats: int = 3
@@ -192,7 +274,54 @@ class Bench:
     """Also write the results here, machine-readable."""
 
 
-Command = Simulate | Train | Evaluate | Render | Demo | Report | Doctor | Bench
+@dataclass(frozen=True, kw_only=True)
+class Import(ImportConfig):
+    """Import recorded trajectories: CSV, Parquet, the published arrays, Juelich text, JuPedSim, ETH, TrajNet++, MATLAB.
+
+    Units and frame rates are declared or read from a header, never guessed; median speed and spacing are printed, so
+    that a wrong one is seen. One long recording becomes scenes of --segment seconds. Beside the file lies a card with
+    source, licence, counts, gaps and outliers. `docs/data.md` has a command for every format.
+
+    Example:
+      swarmnet import bottleneck.txt --dt 0.16 --holdout 0.2 --licence CC-BY-4.0 --out runs/bottleneck.h5
+      swarmnet import a.csv b.csv --unit m --time-unit s --columns t=time id=ped --out runs/walks.h5
+    """
+
+    files: tuple[Path, ...]
+    """Recordings; of the published arrays, the NAME_timeseries.npy."""
+    out: Path = Path("runs/imported.h5")
+    """File to write."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write trajectories in another format: CSV, Parquet, the published arrays, NRI's arrays, GNS's npz and metadata.
+
+    The last three have no masks: scenes in which nodes come and go are refused, or such nodes dropped.
+
+    Example:
+      swarmnet export runs/clear.h5 --format parquet --out clear.parquet
+      swarmnet export runs/clear.h5 --format published --out data/train
+    """
+
+    data: Path
+    """Trajectories to export."""
+    format: Literal["csv", "parquet", "published", "nri", "gns"] = "parquet"
+    """Format to write."""
+    out: Path | None = None
+    """csv, parquet: the file. published: the beginning of the names, as in OUT_timeseries.npy. nri, gns: a folder. By
+    default the data's name in the folder you are in."""
+    partial: Literal["refuse", "drop"] = "refuse"
+    """published, nri, gns: what to do with nodes that are there for part of a scene."""
+    split: Literal["train", "valid", "test"] = "train"
+    """nri, gns: which of the parts this is, for the names of the files."""
+    suffix: str = ""
+    """nri: end of the names, as in loc_train_springs5.npy."""
+    connectivity_radius: float | None = None
+    """gns: who sees whom [m]; by default everybody sees everybody, as in our graphs."""
+
+
+Command = Simulate | Merge | Train | Evaluate | Render | Demo | Report | Doctor | Bench | Import | Export
 
 
 def part_of[T](kind: type[T], config: object) -> T:

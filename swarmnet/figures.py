@@ -23,6 +23,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Affine2D
 
+from envs.collisions import worst_scenes
 from envs.storage import load
 from envs.trajectories import AGENT, GOAL, OBSTACLE, Trajectories
 from gnn.metrics import read_metrics
@@ -58,7 +59,7 @@ class FigureFile:
 
 def learning_curves(rows: list[dict]) -> Figure:
     """Loss and validation error over gradient steps, log scale; bands are the stages of the curriculum."""
-    figure = _figure(NARROW, 4.6)
+    figure = blank_figure(NARROW, 4.6)
     axes = figure.subplots(2, 1, sharex=True)
     step = [row["step"] for row in rows]
     for ax, key, label in ((axes[0], "loss", "training loss"), (axes[1], "validation_error", "validation error")):
@@ -93,7 +94,7 @@ def stages(rows: list[dict]) -> list[tuple[int, int, int]]:
 
 def error_by_horizon(prediction: dict[str, dict], *, dt: float | int) -> Figure:
     """Normalized error (`agents`) of each predicted step, log scale. `prediction`: as in evaluation.json."""
-    figure = _figure(NARROW, 3.7)
+    figure = blank_figure(NARROW, 3.7)
     ax = figure.subplots()
     styles = ((MODEL, "-"), *BASELINES)
     for number, (name, error) in enumerate(prediction.items()):
@@ -116,7 +117,7 @@ def paths_over_paths(
     cross marks where a control step of `solid` ended in which that agent touched something.
     """
     lines, width = math.ceil(len(titles) / columns), NARROW if columns <= 2 else WIDE
-    figure = _figure(width, lines * (width / columns + 0.36))
+    figure = blank_figure(width, lines * (width / columns + 0.36))
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for scene, title in enumerate(titles):
         _panel(panels[scene], solid, dashed, scene, contacts=contacts)
@@ -204,17 +205,17 @@ def goal_distance(trajectories: Trajectories) -> np.ndarray | None:
 
 
 def goal_over_time(runs: dict[str, Trajectories]) -> Figure:
-    """Distance to the goal over time, of expert and model: mean over scenes, and the band that holds 80% of them."""
-    figure = _figure(NARROW, 3.5)
+    """Distance to the goal over time, reference first: mean over scenes, and the band that holds 80% of them."""
+    figure = blank_figure(NARROW, 3.5)
     ax = figure.subplots()
-    for (name, run), (color, line) in zip(runs.items(), ((EXPERT, "--"), (MODEL, "-")), strict=False):
+    for over, (name, run), (color, line) in zip((3, 2), runs.items(), ((EXPERT, "--"), (MODEL, "-")), strict=False):
         distance = goal_distance(run)
         if distance is None or not len(distance):
             continue
         time = run.dt * np.arange(distance.shape[1])
         low, high = np.quantile(distance, [0.1, 0.9], axis=0)
         ax.fill_between(time, low, high, color=color, alpha=0.16, linewidth=0)
-        over = 3 if name == "expert" else 2  # where both agree, the dashes stay visible
+        # Where both agree, the dashes stay visible.
         ax.plot(time, distance.mean(axis=0), color=color, linestyle=line, label=name, gid=name, zorder=over)
     ax.set(xlabel="time [s]", ylabel="distance to the goal [m]")
     ax.set_ylim(bottom=0)
@@ -233,7 +234,7 @@ _RATES = (
 
 def contact_rates(collisions: dict[str, dict]) -> Figure:
     """Contact rates [%] with 95% intervals, expert above model. `collisions` as in evaluation.json, expert first."""
-    figure = _figure(NARROW, 4.4)
+    figure = blank_figure(NARROW, 4.4)
     panels = figure.subplots(len(_RATES), 1)
     for ax, (title, rates) in zip(panels, _RATES, strict=True):
         for number, (name, report) in enumerate(collisions.items()):
@@ -256,10 +257,8 @@ def contact_rates(collisions: dict[str, dict]) -> Figure:
 
 
 def telling_scenes(trajectories: Trajectories, count: int) -> list[int]:
-    """Scenes worth a look: those with the most contact steps first, then scene 0, 1, ..."""
-    touching = (trajectories.agent_contact > 0) | (trajectories.solid_contact > 0)
-    steps = touching.any(axis=2).sum(axis=1)
-    return [int(i) for i in np.argsort(-steps, kind="stable")[:count]]
+    """Scenes worth a look: the worst ones first (`envs.collisions.worst_scenes`)."""
+    return [worst.scene for worst in worst_scenes(trajectories, count)]
 
 
 def read_evaluation(run: Path) -> dict | None:
@@ -334,7 +333,7 @@ def _prediction_figures(run: Path, add: Callable) -> None:
             lambda: paths_over_paths(predicted, truth, titles, columns=2),
         )  # fmt: skip
     evaluation = read_evaluation(run)
-    if evaluation is not None:
+    if evaluation is not None and evaluation["prediction"]:
         dt = evaluation["dt"]
         add(
             "horizon", "Prediction error by horizon",
@@ -348,16 +347,16 @@ def _prediction_figures(run: Path, add: Callable) -> None:
 def _closed_loop_figures(run: Path, add: Callable) -> None:
     evaluation = read_evaluation(run)
     pair = load_pair(run, "expert", "learned")
+    names = [(evaluation or {}).get(key, word) for key, word in (("reference", "expert"), ("policy", "model"))]
     if pair is not None:
         expert, learned = pair
         shown = telling_scenes(learned, 4)
         one, other = learned.take(shown), expert.take(shown)
         titles = [f"scene {scene}" for scene in shown]
         add(
-            "scenes", "The model steers, in physics",
-            "Colour: agents steered by the model in MuJoCo. Grey, dashed: the expert from the same start. Red cross: "
-            "the end of a control step of the model in which that agent touched something. Scenes with most contacts "
-            "of the model come first.",
+            "scenes", "The policy steers, in physics",
+            f"Colour: agents of `{names[1]}` in MuJoCo. Grey, dashed: `{names[0]}` from the same start. Red cross: the "
+            "end of a control step in which that agent touched something. Scenes with most contacts come first.",
             lambda: paths_over_paths(one, other, titles, columns=4, contacts=True),
             lambda: paths_over_paths(one, other, titles, columns=2, contacts=True),
         )  # fmt: skip
@@ -366,12 +365,12 @@ def _closed_loop_figures(run: Path, add: Callable) -> None:
                 "goal", "Distance to the goal",
                 f"Mean over {len(expert)} unseen scenes of the agents' mean distance to the goal; the bands hold 80% "
                 "of the scenes.",
-                lambda: goal_over_time({"expert": expert, "model": learned}),
+                lambda: goal_over_time({names[0]: expert, names[1]: learned}),
             )  # fmt: skip
     if evaluation is not None and evaluation.get("collisions") and evaluation.get("contacts"):
         add(
             "contacts", "Contacts",
-            f"Contacts counted by MuJoCo in {evaluation['scenes']} unseen scenes, with 95% bootstrap intervals over "
+            f"Contacts in {evaluation['scenes']} unseen scenes, with 95% bootstrap intervals over "
             "scenes; `agent`: with another agent, `obstacle`: with an obstacle or wall.",
             lambda: contact_rates(evaluation["collisions"]),
         )  # fmt: skip
@@ -394,7 +393,8 @@ def _log(ax: Axes) -> None:
     ax.yaxis.set_minor_formatter(lambda value, _: f"{value:g}")
 
 
-def _figure(width: float | int, height: float | int) -> Figure:
+def blank_figure(width: float | int, height: float | int) -> Figure:
+    """An empty figure of that size [inches]."""
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure

@@ -1,44 +1,62 @@
-"""Judging a model on unseen scenes: prediction error by horizon, and closed loop in physics beside the expert."""
+"""Judging a policy beside a reference: contacts, collective motion, worst scenes, and prediction error for a model."""
 
+import json
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.collisions import Estimate, collision_report
+from envs.collective import collective_measures, collective_report
+from envs.collisions import WorstScene, collision_report, worst_scenes
 from envs.config import SimulateConfig, World
+from envs.contact_log import ContactLogWriter
+from envs.estimates import Estimate
 from envs.experts.registry import make_expert
 from envs.plain import from_plain, plain
-from envs.policy import Policy
 from envs.rollout import make_rollout
 from envs.storage import save
 from envs.swarm_env import SwarmEnv, scene_keys
-from envs.trajectories import Trajectories, concatenate, from_recording, versions
+from envs.trajectories import Trajectories, from_recording, versions
 from gnn.checkpoint import Model
-from gnn.decode import make_policy, make_predict
+from gnn.decode import make_predict
 from gnn.evaluate import PredictionError, constant_velocity, persistence, prediction_error
 from gnn.windows import Dataset, windows
 from swarm_mjcf.errors import SwarmError
+from swarmnet.closed_loop import Stage, replayed, roll_out
+from swarmnet.policies import EXPERT, Source, find_policy
 from swarmnet.progress import progress
-from swarmnet.results import commit, hardware
+from swarmnet.results import commit, hardware, write_whole
 
-CHUNK = 256
-"""Scenes per batch in closed loop."""
+WORST = 5
+"""Worst scenes that are listed."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """All that was measured. Keys are row names as printed."""
+    """All that was measured. Keys are row names as printed; the reference comes first."""
 
+    policy: str
+    reference: str | None
+    given: dict[str, str | None]
+    """`policy` and `reference` as they were named."""
     prediction: dict[str, PredictionError]
+    """Of a model, beside baselines; empty for anything else."""
     collisions: dict[str, dict[str, Estimate]]
-    """Collision report of the expert and of the model on the same scenes; empty for a model that cannot act."""
+    """Collision report of reference and policy on the same scenes; empty for a model that cannot act."""
+    collective: dict[str, dict[str, Estimate]]
+    """Collective-motion report of the same."""
+    worst: list[WorstScene]
+    """The policy's worst scenes."""
+    contact_log: str | None
+    """File name of the policy's contact log in the run folder."""
     contacts: bool
-    """Whether bodies collide in this world."""
+    """Whether bodies collide, or contacts come from recorded positions."""
     dt: float
-    preset: str
+    preset: str | None
     engine: str
     scenes: int
     steps: int
@@ -47,18 +65,29 @@ class Judgement:
     def plain(self) -> dict:
         """Plain JSON values, with what is needed to measure again."""
         return {
+            "policy": self.policy, "reference": self.reference, "given": self.given,
             "preset": self.preset, "engine": self.engine, "hardware": hardware(), "versions": versions(),
             "commit": commit(),
             "prediction": {
                 name: {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(error).items()}
                 for name, error in self.prediction.items()
             },
-            "collisions": {
-                name: {figure: asdict(estimate) for figure, estimate in report.items()}
-                for name, report in self.collisions.items()
-            },
+            "collisions": _plain(self.collisions), "collective": _plain(self.collective),
+            "worst": [
+                {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(scene).items()}
+                for scene in self.worst
+            ],
+            "contact_log": self.contact_log,
             "contacts": self.contacts, "dt": self.dt, "scenes": self.scenes, "steps": self.steps, "seed": self.seed,
         }  # fmt: skip
+
+    def write(self, folder: Path) -> None:
+        """Writes FOLDER/evaluation.json."""
+        write_whole(folder / "evaluation.json", json.dumps(self.plain(), indent=1))
+
+
+def _plain(reports: dict[str, dict[str, Estimate]]) -> dict:
+    return {name: {figure: asdict(found) for figure, found in report.items()} for name, report in reports.items()}
 
 
 def training_world(model: Model) -> SimulateConfig:
@@ -69,74 +98,129 @@ def training_world(model: Model) -> SimulateConfig:
     return from_plain(SimulateConfig, settings)
 
 
-def roll_out(
-    world: World, policy: Policy, params: object, *, engine: str, scenes: int, steps: int, seed: int, title: str
-) -> Trajectories:
-    """Trajectories of a policy in physics, scenes 0..n-1 of a seed, in batches of one shape."""
-    env = SwarmEnv(world.scene, engine=engine, spawn=world.spawn, horizon=steps)
-    run = make_rollout(env, policy, steps=steps)
-    size = min(CHUNK, scenes)
-    parts = []
-    with progress(title) as update:
-        for first in range(0, scenes, size):
-            keys = scene_keys(seed, range(first, first + size))
-            recording = jax.device_get(run(params, env.reset(keys), keys))
-            about = {"policy": title, "seed": seed, "engine": env.engine.name, "world": plain(world)}
-            parts.append(from_recording(recording, world.scene, about))
-            update(min(first + size, scenes), scenes)
-    return concatenate(parts).take(slice(0, scenes))
-
-
 def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str, label: str = "") -> Judgement:
-    """Rolls out expert and model on the scenes of `config`, measures both, and records them in `folder`/rollouts.
+    """Judges a model beside the expert on the scenes of `config`; see `judge_policy`."""
+    source = Source(given=str(folder), name=name, model=model, folder=folder)
+    return judge_policy(source, find_policy(EXPERT), Stage.of(config), folder, label=label)
 
-    `label` stands before the titles of the progress bars.
 
-    Raises SwarmError when the scenes are those of the training data.
+def judge_policy(
+    source: Source,
+    reference: Source | None,
+    stage: Stage,
+    folder: Path,
+    *,
+    label: str = "",
+    log: Literal["csv", "parquet"] = "csv",
+) -> Judgement:
+    """Rolls out or replays reference and policy on the same scenes, measures both, and records them in `folder`.
+
+    rollouts/expert.h5 is the reference's recording and rollouts/learned.h5 the policy's; contacts.csv or .parquet is
+    the policy's contact log. Where one of both is a recording, contacts of both come from their positions. `label`
+    stands before the titles of the progress bars.
+
+    Raises:
+      SwarmError: the scenes are those of a model's training data, its dt is not the world's, recordings do not hold the
+        same number of scenes, rows and nodes, or a policy cannot be used.
     """
-    trained = model.about["data"].get("simulate", {})
-    if trained.get("seed") == config.seed and trained.get("preset") == config.preset:
-        raise SwarmError(f"seed {config.seed} is the training data's own; unseen scenes need another seed")
-    world = config.world()
-    if (world.scene.dt, world.scene.substeps) != (model.integrator.dt, model.integrator.substeps):
+    if source.model is not None:
+        _check_model(source.model, stage)
+    if reference is not None and not reference.acts and reference.recording is None:
+        raise SwarmError(f"{reference.given}: predicts changes of state, so it cannot be a reference in closed loop")
+    if reference is not None and reference.name == source.name:
+        reference = replace(reference, name=f"{reference.name} (reference)")
+    done: dict[str, Trajectories] = {}
+    by_geometry = any(one is not None and one.recording is not None for one in (source, reference))
+
+    def perform(one: Source, writer: ContactLogWriter | None = None) -> Trajectories:
+        if one.recording is not None:
+            return replayed(one.recording, log=writer)
+        found = roll_out(stage, one, title=f"{label}{one.name} in physics", log=None if by_geometry else writer)
+        return replayed(found, log=writer) if by_geometry else found
+
+    log_path = folder / f"contacts.{log}"
+    if source.model is None or source.acts:
+        with ContactLogWriter(log_path) as writer:  # an error in here leaves the old log
+            acted = perform(source, writer)
+            if reference is not None:
+                done[reference.name] = perform(reference)
+            done[source.name] = acted
+            _check_same_shape(done)
+    elif reference is not None:
+        done[reference.name] = perform(reference)
+    _record(folder, done.get(reference.name) if reference else None, done.get(source.name), log_path.name)
+    acted = done.get(source.name)
+    truth = next(iter(done.values()))
+    if source.model is not None and source.acts and stage.starts is None:
+        sweep(stage.world, source.model, folder, engine=stage.engine, steps=stage.steps, seed=stage.seed)
+    return Judgement(
+        policy=source.name,
+        reference=reference.name if reference else None,
+        given={"policy": source.given, "reference": reference.given if reference else None},
+        prediction=_predictions(source, truth, label) if source.model is not None and reference is not None else {},
+        collisions={name: collision_report(found) for name, found in done.items()} if acted else {},
+        collective={name: collective_report(collective_measures(found)) for name, found in done.items()}
+        if acted
+        else {},
+        worst=worst_scenes(acted, WORST) if acted else [],
+        contact_log=log_path.name if acted else None,
+        contacts=source.recording is not None or stage.world.scene.contacts,
+        dt=truth.dt,
+        preset=stage.simulate.preset if stage.simulate else None,
+        engine=str((acted or truth).provenance.get("engine", "none")),
+        scenes=len(truth),
+        steps=truth.position.shape[1] - 1,
+        seed=stage.seed,
+    )
+
+
+def _check_same_shape(done: dict[str, Trajectories]) -> None:
+    shapes = {name: found.position.shape[:3] for name, found in done.items()}
+    if len(set(shapes.values())) > 1:
+        told = ", ".join(f"{name} has {s} scenes of {t} rows and {v} nodes" for name, (s, t, v) in shapes.items())
+        raise SwarmError(f"policy and reference cannot be compared: {told}")
+
+
+def _record(folder: Path, reference: Trajectories | None, acted: Trajectories | None, log: str) -> None:
+    """Writes rollouts/, and removes what an earlier judgement left that this one does not write."""
+    for name, found in (("expert.h5", reference), ("learned.h5", acted)):
+        if found is None:
+            (folder / "rollouts" / name).unlink(missing_ok=True)
+        else:
+            save(folder / "rollouts" / name, found)
+    for name in ("rollouts/sweep_truth.h5", "rollouts/sweep_predicted.h5", "contacts.csv", "contacts.parquet"):
+        if acted is None or name != log:
+            (folder / name).unlink(missing_ok=True)
+
+
+def _check_model(model: Model, stage: Stage) -> None:
+    trained, scene = model.about["data"].get("simulate", {}), stage.world.scene
+    here = stage.simulate
+    if here and stage.starts is None and (trained.get("seed"), trained.get("preset")) == (here.seed, here.preset):
+        raise SwarmError(f"seed {stage.seed} is the training data's own; unseen scenes need another seed")
+    if (scene.dt, scene.substeps) != (model.integrator.dt, model.integrator.substeps):
         raise SwarmError(
             f"the model was trained at dt {model.integrator.dt} s with {model.integrator.substeps} substeps, this "
-            f"world has {world.scene.dt} s with {world.scene.substeps}"
+            f"world has {scene.dt} s with {scene.substeps}"
         )
-    shared = {"engine": config.engine, "scenes": config.scenes, "steps": config.steps, "seed": config.seed}
-    expert = roll_out(world, make_expert(world.expert), None, title=f"{label}expert in physics", **shared)
-    save(folder / "rollouts" / "expert.h5", expert)
-    collisions = {}
-    for stale in ("learned.h5", "sweep_truth.h5", "sweep_predicted.h5"):  # of an earlier model that could steer
-        (folder / "rollouts" / stale).unlink(missing_ok=True)
-    if model.config.output == "acceleration":
-        policy = make_policy(model.config, model.scales, goal=world.scene.goal)
-        learned = roll_out(world, policy, model.params, title=f"{label}{name} in physics", **shared)
-        save(folder / "rollouts" / "learned.h5", learned)
-        collisions = {"expert": collision_report(expert), name: collision_report(learned)}
-        sweep(world, model, folder, engine=config.engine, steps=config.steps, seed=config.seed)
+
+
+def _predictions(source: Source, truth: Trajectories, label: str) -> dict[str, PredictionError]:
+    """Prediction error of the model and of the baselines on the reference's trajectories."""
+    model = source.model
+    assert model is not None
     predictors = {
-        name: (make_predict(model.config, model.scales, model.integrator), model.params),
-        "constant velocity": (constant_velocity(world.scene.dt), {}),
+        source.name: (make_predict(model.config, model.scales, model.integrator), model.params),
+        "constant velocity": (constant_velocity(truth.dt), {}),
         "persistence": (persistence, {}),
     }
-    prediction = {}
+    found = {}
     for row, (predict, params) in predictors.items():
         with progress(f"{label}predict, {row}") as update:
-            prediction[row] = prediction_error(
-                predict, params, expert, window=model.config.window, progress=lambda a, b, update=update: update(a, b)
+            found[row] = prediction_error(
+                predict, params, truth, window=model.config.window, progress=lambda a, b, update=update: update(a, b)
             )
-    return Judgement(
-        prediction=prediction,
-        collisions=collisions,
-        contacts=world.scene.contacts,
-        dt=world.scene.dt,
-        preset=config.preset,
-        engine=expert.provenance["engine"],
-        scenes=config.scenes,
-        steps=config.steps,
-        seed=config.seed,
-    )
+    return found
 
 
 def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, seed: int) -> None:
@@ -180,23 +264,39 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
 
 def tables(judgement: Judgement) -> str:
     """What was measured, as text."""
-    lines = [
-        f"normalized prediction error (published metric), dt {judgement.dt} s, {judgement.scenes} unseen scenes",
-        "  "
-        + " " * 20
-        + "".join(f"{h:>4} steps mean / median   " for h in next(iter(judgement.prediction.values())).horizons),
-    ]
+    lines = []
+    if judgement.prediction:
+        horizons = next(iter(judgement.prediction.values())).horizons
+        lines += [
+            f"normalized prediction error (published metric), dt {judgement.dt} s, {judgement.scenes} unseen scenes",
+            "  " + " " * 20 + "".join(f"{h:>4} steps mean / median   " for h in horizons),
+        ]
     for row, e in judgement.prediction.items():
         cells = (
             f"{mean:14.4g} / {median:<9.4g}" for mean, median in zip(e.published_mean, e.published_median, strict=True)
         )
         lines.append(f"  {row:20}" + "".join(cells))
-    if judgement.collisions:
-        lines.append(
-            "closed loop in physics on the same scenes" + ("" if judgement.contacts else " (contacts are off here)")
-        )
-        names = list(judgement.collisions)
-        lines.append("  " + " " * 38 + "".join(f"{name:>32}" for name in names))
-        for figure in judgement.collisions[names[0]]:
-            lines.append(f"  {figure:38}" + "".join(f"{judgement.collisions[n][figure]!s:>32}" for n in names))
+    if not judgement.collisions:
+        return "\n".join(lines)
+    how = "positions replayed" if judgement.engine == "none" else "closed loop in physics"
+    scenes = f"{judgement.scenes} scenes, {judgement.steps} steps of {judgement.dt:g} s"
+    lines.append(f"{how}, {scenes}" + ("" if judgement.contacts else " (contacts are off here)"))
+    lines += _side_by_side(judgement.collisions)
+    lines.append("collective motion on the same scenes")
+    lines += _side_by_side(judgement.collective)
+    lines.append(f"worst scenes of {judgement.policy}")
+    lines += [
+        f"  scene {w.scene:5}   {w.contact_steps:3} contact steps   deepest {w.deepest_penetration:.3g} m   "
+        f"least clearance {w.minimum_clearance:.3g} m"
+        for w in judgement.worst
+    ]
     return "\n".join(lines)
+
+
+def _side_by_side(reports: dict[str, dict[str, Estimate]]) -> list[str]:
+    names = list(reports)
+    lines = ["  " + " " * 38 + "".join(f"{name:>32}" for name in names)]
+    for figure in reports[names[-1]]:  # a reference in a world with a goal may have more
+        cells = "".join(f"{reports[name].get(figure, '')!s:>32}" for name in names)
+        lines.append(f"  {figure:38}" + cells)
+    return lines

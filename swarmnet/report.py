@@ -21,6 +21,8 @@ from gnn.metrics import read_metrics
 from swarm_mjcf.errors import SwarmError
 from swarmnet.config import Demo, Evaluate, Simulate, Train
 from swarmnet.figures import FigureFile, make_figures, read_evaluation
+from swarmnet.figures_collective import make_collective_figures
+from swarmnet.report_tables import collective_table, collision_cells, interval_of, number, shown, worst_table
 from swarmnet.results import commit, hardware, write_whole
 from swarmnet.videos import VideoFile, find_videos
 
@@ -41,16 +43,22 @@ class Facts:
 
     @property
     def model(self) -> str:
-        """The model's row name: the first row of the prediction table."""
-        return next(iter(self.evaluation["prediction"])) if self.evaluation else "model"
+        """The policy's row name."""
+        e = self.evaluation or {}
+        return e.get("policy") or next(iter(e.get("prediction", {})), "model")
+
+    @property
+    def reference(self) -> str:
+        """The row name of what it is judged by."""
+        return (self.evaluation or {}).get("reference") or "expert"
 
     def pair(self, figure: str) -> tuple[dict, dict] | None:
-        """Estimates of the model and of the expert, where both were measured; contact figures only with contacts on."""
+        """Estimates of policy and reference, where both were measured; contact figures only with contacts on."""
         e = self.evaluation or {}
         reports = e.get("collisions") or {}
-        if not {"expert", self.model} <= set(reports) or ("contact" in figure and not e.get("contacts")):
+        if not {self.reference, self.model} <= set(reports) or ("contact" in figure and not e.get("contacts")):
             return None
-        both = reports[self.model].get(figure), reports["expert"].get(figure)
+        both = reports[self.model].get(figure), reports[self.reference].get(figure)
         return both if all(both) else None
 
 
@@ -72,10 +80,12 @@ def write_report(run: str | Path) -> Path:
             "lead": _lead(facts),
             "tiles": _tiles(facts),
             **_missing(facts),
-            "figures": "".join(_figure(figure) for figure in make_figures(run)),
+            "figures": "".join(_figure(figure) for figure in make_figures(run) + make_collective_figures(run)),
             "videos": "".join(_video(video, first=not k) for k, video in enumerate(find_videos(run))),
             **_prediction(facts),
-            **_collisions(facts),
+            **collision_cells(facts.evaluation),
+            **collective_table(facts.evaluation),
+            **worst_table(facts.evaluation),
             "settings": _settings(facts),
             "again": "\n".join(f"{escape(line)}  <i># {escape(why)}</i>" for line, why in commands(facts)),
             **_notes(facts),
@@ -101,8 +111,9 @@ def _gather(run: Path) -> Facts:
         newest = checkpoints.newest()
         about = None if newest is None else newest[1] | {"step": newest[0]}
         checkpoints.close()
-    if (run / "rollouts" / "expert.h5").exists():
-        counts = load(run / "rollouts" / "expert.h5", scenes=1).counts
+    for name in ("learned.h5", "expert.h5"):
+        if (run / "rollouts" / name).exists():
+            counts = load(run / "rollouts" / name, scenes=1).counts
     if (run / "config.json").exists():
         try:
             demo = json.loads((run / "config.json").read_text())
@@ -126,27 +137,30 @@ def _lead(facts: Facts) -> str:
     if facts.evaluation:
         e, (_, obstacles, agents) = facts.evaluation, facts.counts or (0, 0, 0)
         crowd = f", {agents} agent{'s' * (agents != 1)} and {obstacles} obstacle{'s' * (obstacles != 1)} in each"
+        rows, who = e["prediction"], _who(facts.reference)
+        recorded = str(e.get("given", {}).get("policy")).endswith(".h5")
+        judged = f"judged on {e['scenes']} scenes that it had never seen (seed {e['seed']})"
+        judged = f"replayed from recorded positions of {e['scenes']} scenes" if recorded else judged
         said.append(
-            f"It was judged on {e['scenes']} scenes that it had never seen (seed {e['seed']}), {e['steps']} control "
-            f"steps of {e['dt']:g} s each{crowd if agents else ''}."
+            f"{'It' if rows else _who(facts.model)} was {judged}, {e['steps']} control steps of {e['dt']:g} s each"
+            f"{crowd if agents else ''}."
         )
         if both := facts.pair("final_goal_distance"):
             said.append(
-                f"Steering the agents itself in MuJoCo, it ends {_value(both[0])} from the goal on average; the "
-                f"expert, from the same starts, {_value(both[1])}{_overlap(*both)}."
+                f"{'It' if recorded else 'Steering the agents itself in MuJoCo, it'} ends {shown(both[0])} from the "
+                f"goal on average; {who}, from the same starts, {shown(both[1])}{_overlap(*both, who)}."
             )
         if both := facts.pair("contact_steps_any"):
             said.append(
-                f"Something touches in {_value(both[0])} of its control steps, in {_value(both[1])} of the expert's"
-                f"{_overlap(*both)}."
+                f"Something touches in {shown(both[0])} of its control steps, in {shown(both[1])} of those of {who}"
+                f"{_overlap(*both, who)}."
             )
-        rows = e["prediction"]
-        first, *others = rows
-        near = [h for h in (5, 40) if h in rows[first]["horizons"]]
+        first, *others = rows or [""]
+        near = [h for h in (5, 40) if rows and h in rows[first]["horizons"]]
         if near:
             parts = [
-                f"{_number(_error(rows[first], h))} at {h} steps ("
-                + ", ".join(f"{escape(name)} {_number(_error(rows[name], h))}" for name in others) + ")"
+                f"{number(_error(rows[first], h))} at {h} steps ("
+                + ", ".join(f"{escape(name)} {number(_error(rows[name], h))}" for name in others) + ")"
                 for h in near
             ]  # fmt: skip
             said.append("Predicting without ever being corrected, its normalized error is " + " and ".join(parts) + ".")
@@ -160,12 +174,16 @@ def _minutes(facts: Facts) -> str:
     return f" ({seconds / 60:.1f} minutes)" if seconds >= 60 else f" ({seconds:.0f} seconds)" if seconds else ""
 
 
-def _overlap(one: dict, other: dict) -> str:
+def _who(name: str) -> str:
+    return "the expert" if name == "expert" else f"<code>{escape(name)}</code>"
+
+
+def _overlap(one: dict, other: dict, who: str) -> str:
     if None in (one["low"], one["high"], other["low"], other["high"]):
         return ""
     if one["low"] <= other["high"] and other["low"] <= one["high"]:
         return " (the 95% intervals overlap)"
-    return f" (the 95% intervals are apart: {'more' if one['low'] > other['high'] else 'less'} than the expert)"
+    return f" (the 95% intervals are apart: {'more' if one['low'] > other['high'] else 'less'} than {who})"
 
 
 def _tiles(facts: Facts) -> str:
@@ -181,23 +199,23 @@ def _tiles(facts: Facts) -> str:
     }
     for figure, label in labels.items():
         if both := facts.pair(figure):
-            tile(label, _value(both[0], interval=False), f"model, {_interval(both[0])}<br>expert {_value(both[1])}")
-    if facts.evaluation:
-        rows = facts.evaluation["prediction"]
+            who = escape(facts.reference)
+            tile(label, shown(both[0], interval=False), f"policy, {interval_of(both[0])}<br>{who} {shown(both[1])}")
+    if rows := (facts.evaluation or {}).get("prediction"):
         name, *others = rows
         for horizon in (5, 40):
             if horizon in rows[name]["horizons"]:
-                beside = "<br>".join(f"{escape(other)} {_number(_error(rows[other], horizon))}" for other in others)
+                beside = "<br>".join(f"{escape(other)} {number(_error(rows[other], horizon))}" for other in others)
                 label = f"Prediction error, {horizon} steps"
-                tile(label, _number(_error(rows[name], horizon)), beside)
+                tile(label, number(_error(rows[name], horizon)), beside)
     return "".join(tiles)
 
 
 def _missing(facts: Facts) -> dict[str, str]:
     """What is not there and could be."""
-    steered = (facts.run / "rollouts" / "learned.h5").exists()
+    steered = _two_recordings(facts.run)
     found = {
-        "no_model": "" if facts.about else "yes",
+        "no_model": "" if facts.about or (facts.evaluation and not facts.evaluation["prediction"]) else "yes",
         "no_evaluation": "" if facts.evaluation else "yes",
         "no_videos": escape(_render(facts.run)) if steered and not find_videos(facts.run) else "",
     }
@@ -228,9 +246,9 @@ def _figure(figure: FigureFile) -> str:
 
 def _prediction(facts: Facts) -> dict[str, str]:
     """The two tables of prediction error."""
-    if not facts.evaluation:
-        return {}
     e = facts.evaluation
+    if not e or not e["prediction"]:
+        return {}
     return {
         "prediction": _error_table(e["prediction"], "published", facts.model),
         "prediction_agents": _error_table(e["prediction"], "agents", facts.model),
@@ -244,28 +262,13 @@ def _error_table(rows: dict[str, dict], metric: str, model: str) -> str:
     lines = []
     for name, error in rows.items():
         pairs = zip(error[f"{metric}_mean"], error[f"{metric}_median"], strict=True)
-        cells = "".join(f"<td>{_number(mean)}<br><small>{_number(median)}</small></td>" for mean, median in pairs)
+        cells = "".join(f"<td>{number(mean)}<br><small>{number(median)}</small></td>" for mean, median in pairs)
         kind = ' class="model"' if name == model else ""
         lines.append(f"<tr{kind}><th>{escape(name)}</th>{cells}</tr>")
     windows = "".join(f"<td><small>{count}</small></td>" for count in rows[model]["windows"])
     lines.append(f"<tr><td><small>windows</small></td>{windows}</tr>")
     table = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(lines)}</tbody>"
     return f'<div class="table"><table>{table}</table></div>'
-
-
-def _collisions(facts: Facts) -> dict[str, str]:
-    """Cells of each figure by its name; the template has a row for each (tested)."""
-    reports = (facts.evaluation or {}).get("collisions")
-    if not reports:
-        return {}
-    cells = {
-        figure: "".join(
-            f"<td>{_value(estimate, interval=False)}<br>{_interval(estimate)}</td>"
-            for estimate in (report[figure] for report in reports.values())
-        )
-        for figure in next(iter(reports.values()))
-    }
-    return cells | {"collisions": "".join(f"<th>{escape(name)}</th>" for name in reports)}
 
 
 def _settings(facts: Facts) -> str:
@@ -280,7 +283,7 @@ def _settings(facts: Facts) -> str:
         "Training data": {"scenes trained on": data.get("scenes"), "expert": data.get("expert")}
         | data.get("simulate", {}),
         "World: scene": world.get("scene", {}),
-        "World: expert and start": world.get("boids", {}) | world.get("spawn", {}),
+        "World: expert and start": world.get("expert", {}) | world.get("spawn", {}),
         "Model": {"preset": about.get("preset")} | about.get("model", {}),
         "Training": {"steps done": about.get("step")} | about.get("train", {}),
         "Evaluation": judged | counts,
@@ -313,16 +316,34 @@ def commands(facts: Facts) -> list[tuple[str, str]]:
             train["validation"] = kept / all_scenes
         found.append((["swarmnet", "train", str(data), *_flags(Train, train)], "model and learning curves"))
     if e:
-        judged = {key: e[key] for key in ("scenes", "steps", "seed", "preset") if key in e}
+        judged = {key: e[key] for key in ("scenes", "steps", "seed", "preset") if key in e} | _given(facts)
+        if e.get("preset") == about.get("data", {}).get("simulate", {}).get("preset"):
+            judged.pop("preset", None)  # the model's training world, whatever else was set there
+        elif facts.counts and judged.get("preset"):
+            judged |= dict(zip(("num_obstacles", "num_agents"), facts.counts[1:], strict=True))
         found.append((["swarmnet", "evaluate", str(run), *_flags(Evaluate, judged)], "rollouts, tables, figures"))
     found.append((["swarmnet", "report", str(run)], "this page and figures/"))
     lines = [(shlex.join(words), comment) for words, comment in found]
-    return [*lines, (_render(run), "one video")] if (run / "rollouts" / "learned.h5").exists() else lines
+    return [*lines, (_render(run), "one video")] if _two_recordings(run) else lines
+
+
+def _two_recordings(run: Path) -> bool:
+    return all((run / "rollouts" / f"{name}.h5").exists() for name in ("expert", "learned"))
+
+
+def _given(facts: Facts) -> dict[str, str]:
+    """Policy and reference as they were named; a run's own model needs no name."""
+    given = (facts.evaluation or {}).get("given")
+    if not given:
+        return {}
+    named = {"reference": given["reference"] or "none"}
+    own = facts.evaluation and facts.evaluation["prediction"] and Path(given["policy"]).resolve() == facts.run.resolve()
+    return named if own else named | {"policy": given["policy"]}
 
 
 def _render(run: Path) -> str:
     rollouts = run / "rollouts"
-    words = ["swarmnet", "render", str(rollouts / "expert.h5"), "--beside", str(rollouts / "learned.h5")]
+    words = ["swarmnet", "render", str(rollouts / "expert.h5"), str(rollouts / "learned.h5")]
     return shlex.join([*words, "--scene", "0", "--out", str(run / "videos" / "mine.mp4")])
 
 
@@ -350,8 +371,8 @@ def _notes(facts: Facts) -> dict[str, str]:
     found = {
         "note_contacts_off": e and not e.get("contacts", True),
         "note_cannot_steer": e and not e.get("collisions"),
-        "note_one_seed": e,
-        "note_open_loop": e and e.get("collisions"),
+        "note_one_seed": e and e["prediction"],
+        "note_open_loop": e and e["prediction"] and e.get("collisions"),
         "note_unfinished": f"{about['step']} of {planned}" if about and about["step"] < planned else "",
         "note_short": f"{planned / full:.0%} of the full {full}" if planned and planned < full else "",
     }
@@ -362,29 +383,6 @@ def _notes(facts: Facts) -> dict[str, str]:
 def _error(row: dict, horizon: int) -> float | None:
     """The published mean at a horizon."""
     return row["published_mean"][row["horizons"].index(horizon)] if horizon in row["horizons"] else None
-
-
-def _number(value: float | int | None) -> str:
-    """Three significant digits; a dash for what is not a number."""
-    if value is None or value != value:
-        return "–"
-    if 1000 <= abs(value) < 1e6 or value == 0:
-        return f"{value:.0f}"
-    return f"{value:#.3g}".removesuffix(".") if abs(value) >= 1 else f"{value:.3g}"
-
-
-def _value(estimate: dict, *, interval: bool = True) -> str:
-    share = estimate["unit"] == "share"
-    value = _number(None if estimate["value"] is None else estimate["value"] * (100 if share else 1))
-    shown = f"{value}&nbsp;{'%' if share else escape(estimate['unit'])}".removesuffix("&nbsp;")
-    return f"{shown} {_interval(estimate)}".strip() if interval else shown
-
-
-def _interval(estimate: dict) -> str:
-    if estimate["low"] is None or estimate["high"] is None:
-        return ""
-    scale = 100 if estimate["unit"] == "share" else 1
-    return f"<span class=range>[{_number(estimate['low'] * scale)}, {_number(estimate['high'] * scale)}]</span>"
 
 
 def _plain(value: object) -> str:

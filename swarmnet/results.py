@@ -67,12 +67,12 @@ def _command(arguments: list[str]) -> str:
     return " ".join(["swarmnet", *kept])
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Writes a text file under a temporary name and renames it. Raises SwarmError with the reason."""
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Writes a file under a temporary name and renames it. Raises SwarmError with the reason."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text)
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True) if partial.parent.is_dir() else None

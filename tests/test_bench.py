@@ -1,4 +1,4 @@
-"""What the benchmarks measure is what they say: bodies meet, batches are as asked, results come in the common format."""
+"""Benchmarks measure what they say: bodies meet, batches are as asked, results come in the common format."""
 
 import json
 

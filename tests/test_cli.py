@@ -13,7 +13,7 @@ from swarm_mjcf.errors import SwarmError
 from swarmnet.cli import main
 from swarmnet.results import Results, Row, write_results
 
-COMMANDS = ("simulate", "train", "evaluate", "render", "demo", "report", "doctor", "bench")
+COMMANDS = ("simulate", "merge", "import", "export", "train", "evaluate", "render", "demo", "report", "doctor", "bench")
 HEAVY = ("jax", "mujoco", "flax", "orbax", "h5py", "matplotlib", "optax", "dm_control", "numpy")
 PROBE = f"""
 import sys

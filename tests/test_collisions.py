@@ -8,7 +8,7 @@ from helpers import make_trajectories
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.collisions import NEAR_GOAL, Estimate, collision_report
+from envs.collisions import NEAR_GOAL, Estimate, collision_report, worst_scenes
 from envs.trajectories import AGENT, GOAL, OBSTACLE, Trajectories, edge_types
 
 
@@ -194,3 +194,30 @@ def test_figures_are_printed_with_interval_and_unit():
     assert str(Estimate(0.125, 0.1, 0.15, "share")) == "12.5 [10, 15] %"
     assert str(Estimate(0.25, None, None, "m")) == "0.25 m"
     assert str(Estimate(2.0, 1.0, 3.0, "")) == "2 [1, 3]"
+
+
+def test_worst_scenes_by_contact_steps_then_depth_then_clearance():
+    t = still_life(scenes=5)
+    t.agent_contact[3, 1:3, 2] = 4  # two steps
+    t.solid_contact[1, 2, 3] = 9  # one step, at 9 states
+    t.agent_contact[2, 4, 2:] = 1  # one step of two agents, deeper
+    t.depth[2, 4, 2] = 0.3
+    t.depth[1, 2, 3] = 0.2
+    t.position[4, 2, 3] = 40, 5  # near misses count last
+    t.agent_contact[0, 0, 2] = 9  # not a step
+    worst = worst_scenes(t, 4)
+    assert [w.scene for w in worst] == [3, 2, 1, 4]
+    assert [w.contact_steps for w in worst] == [2, 1, 1, 0]
+    assert [w.deepest_penetration for w in worst] == pytest.approx([0, 0.3, 0.2, 0])
+    assert worst[-1].minimum_clearance == 5 - 2
+    assert [w.scene for w in worst_scenes(t, 99)] == [3, 2, 1, 4, 0]
+
+
+def test_a_scene_of_absent_agents_is_the_least_bad():
+    mask = np.ones((2, 5, 4), bool)
+    mask[0, :, 2:] = False
+    t = still_life(mask=mask, **contacts(agent_contact=[(0, 1, 3, 7)]))
+    worst = worst_scenes(t, 2)
+    assert [w.scene for w in worst] == [1, 0]
+    assert worst[1].minimum_clearance == math.inf
+    assert worst[1].contact_steps == 0

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from envs.collective import UNITS, collective_measures
 from envs.storage import save
 from envs.trajectories import AGENT, GOAL, OBSTACLE, Trajectories, edge_types
 from swarm_mjcf.build import agent_color
@@ -21,6 +22,7 @@ from swarmnet.figures import (
     svg,
     telling_scenes,
 )
+from swarmnet.figures_collective import make_collective_figures, measures_over_time, quantiles
 
 ROWS = [
     {"step": 10 * n, "stage": n > 2, "horizon": 5 if n > 2 else 1, "loss": 1 / n, "validation_error": 2 / n,
@@ -190,3 +192,52 @@ def test_an_unreadable_evaluation_is_named(tmp_path) -> None:
     (tmp_path / "evaluation.json").write_text("[]")
     with pytest.raises(SwarmError, match="holds no evaluation"):
         make_figures(tmp_path)
+
+
+def test_quantiles_are_over_the_scenes_that_have_a_value() -> None:
+    values = np.array([[1.0, 5], [2, np.nan], [3, np.nan], [np.nan, np.nan]])
+    values = np.concatenate([values, np.full((4, 1), np.nan)], axis=1)
+    np.testing.assert_array_equal(quantiles(values, (0.0, 0.5, 1.0)), [[1, 5, np.nan], [2, 5, np.nan], [3, 5, np.nan]])
+
+
+def test_measures_over_time_are_medians_with_bands() -> None:
+    rng = np.random.default_rng(0)
+    runs = {name: {measure: rng.random((40, 6)) for measure in UNITS} for name in ("expert", "mine")}
+    figure = measures_over_time(runs, dt=0.5, columns=4)
+    for panel, measure in enumerate(UNITS):
+        for name, measures in runs.items():
+            x, y = drawn(figure, name, panel)
+            np.testing.assert_allclose(x, 0.5 * np.arange(6))
+            np.testing.assert_allclose(y, np.median(measures[measure], axis=0))
+            (band,) = (c for c in figure.axes[panel].collections if c.get_gid() == f"band {name}")
+            corners = band.get_paths()[0].vertices
+            low, high = np.quantile(measures[measure], [0.1, 0.9], axis=0)
+            np.testing.assert_allclose([corners[:, 1].min(), corners[:, 1].max()], [low.min(), high.max()])
+        assert ("[m]" in figure.axes[panel].get_title()) == bool(UNITS[measure])
+    alone = measures_over_time({"mine": runs["mine"]}, dt=0.5, names=("spread",))
+    assert alone.axes[0].get_ylabel() == "spread, mean [m]"
+
+
+def test_collective_figures_of_a_run_and_when_they_are_made_anew(tmp_path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    assert make_collective_figures(run) == []
+    save(run / "rollouts" / "expert.h5", scenes(4))
+    save(run / "rollouts" / "learned.h5", scenes(4, shift=1.0))
+    about = {
+        "prediction": {},
+        "collective": {"expert": {}},
+        "reference": "expert",
+        "policy": "mine",
+        "dt": 0.5,
+        "scenes": 4,
+    }
+    (run / "evaluation.json").write_text(json.dumps(about))
+    (figure,) = make_collective_figures(run)
+    pictures = sorted((run / "figures").glob("*.png"))
+    assert [path.stem.removeprefix("collective-") for path in pictures] == sorted(UNITS)
+    assert figure.path.read_text().rstrip().endswith("</svg>")
+    assert set(collective_measures(scenes())) == set(UNITS)
+    before = [path.stat().st_mtime_ns for path in pictures]
+    make_collective_figures(run)
+    assert [path.stat().st_mtime_ns for path in pictures] == before

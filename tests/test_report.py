@@ -205,7 +205,7 @@ def test_commands_parse_and_say_what_was_done(tmp_path) -> None:
     assert round(train.validation * 60) == 10
     assert (parsed[Evaluate].run, parsed[Evaluate].scenes, parsed[Evaluate].seed) == (run, 77, 99)
     assert parsed[Report].run == run
-    assert parsed[Render].data == run / "rollouts" / "expert.h5"
+    assert parsed[Render].data == (run / "rollouts" / "expert.h5", run / "rollouts" / "learned.h5")
     demo = {"name": "x", "scenes": 44, "test_scenes": 5, "model": "best", "scale": 0.1, "seed": 7, "engine": "auto"}
     (run / "config.json").write_text(json.dumps(demo | {"videos": 0}))
     parsed = {type(config): config for config in map(_parsed, commands(_gather(run)))}

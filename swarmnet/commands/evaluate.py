@@ -1,36 +1,89 @@
 """`swarmnet evaluate`."""
 
-import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 from envs.config import SimulateConfig
-from gnn.checkpoint import load_model
+from swarm_mjcf.errors import SpecError, SwarmError
+from swarmnet.closed_loop import Stage, stage_of_recording
 from swarmnet.config import Evaluate
-from swarmnet.judge import Judgement, judge, tables, training_world
+from swarmnet.judge import Judgement, judge_policy, tables, training_world
+from swarmnet.policies import EXPERT, Source, find_policy, model_source
 from swarmnet.progress import progress
 from swarmnet.report import write_report
-from swarmnet.results import Results, Row, write_results, write_whole
-from swarmnet.videos import make_videos
+from swarmnet.results import Results, Row, write_results
+from swarmnet.videos import make_video, make_videos
 
-VIDEOS = 3
-"""Scenes to make videos of."""
+NONE = "none"
+"""As a reference: there is none."""
 
 
 def run(config: Evaluate) -> int:
     """Judges and prints; records everything in the run folder."""
-    model = load_model(config.run / "checkpoints")
-    world = training_world(model) if config.preset is None else SimulateConfig(preset=config.preset)
-    world = replace(world, scenes=config.scenes, steps=config.steps, seed=config.seed, engine=config.engine)
-    name = f"swarmnet {model.about['preset']}"
-    judgement = judge(model, world, config.run, name=name)
-    write_whole(config.run / "evaluation.json", json.dumps(judgement.plain(), indent=1))
+    for field, least in (("scenes", 1), ("steps", 1), ("seed", 0), ("videos", 0)):
+        if getattr(config, field) < least:
+            raise SpecError(field, getattr(config, field), f"at least {least}")
+    if config.policy is None and config.run is None:
+        raise SwarmError("nothing to judge: give a run folder with a trained model, or --policy")
+    source = find_policy(config.policy) if config.policy is not None else model_source(config.run or Path())
+    reference = None if config.reference == NONE else find_policy(config.reference)
+    stage, reference = _stage(config, source, reference)
+    folder = config.run or source.folder or Path("runs") / f"evaluate-{_slug(source.name)}"
+    judgement = judge_policy(source, reference, stage, folder, log=config.log)
+    judgement.write(folder)
     print(tables(judgement))
     if config.json:
         write_results(config.json, as_results(judgement))
-    with progress("videos") as update:
-        make_videos(config.run, VIDEOS, progress=update)
-    print(f"report: {write_report(config.run)}")
+    if config.videos:
+        _videos(folder, judgement, config.videos)
+    if judgement.contact_log:
+        print(f"contact log: {folder / judgement.contact_log}")
+    print(f"report: {write_report(folder)}")
     return 0
+
+
+def _stage(config: Evaluate, source: Source, reference: Source | None) -> tuple[Stage, Source | None]:
+    """The scenes for both. A recording is judged alone where its world is not known and no reference was asked for."""
+    both = [one for one in (source, reference) if one is not None]
+    recording = next((one.recording for one in both if one.recording is not None), None)
+    if recording is not None:
+        options = {"preset": config.preset, "engine": config.engine, "seed": config.seed}
+        if any(one.make is not None or one.model is not None for one in both):
+            try:
+                return stage_of_recording(recording, **options), reference
+            except SwarmError as error:
+                if source.recording is None or config.reference != EXPERT or config.preset is not None:
+                    raise
+                print(f"judged without a reference: {error}")
+                reference = None
+        # Nothing is simulated; a world is still what a stage consists of.
+        stage = Stage.of(SimulateConfig(scenes=len(recording), steps=max(1, recording.position.shape[1] - 1)))
+        return replace(stage, simulate=None), reference
+    world = SimulateConfig(preset=config.preset) if config.preset else SimulateConfig()
+    if source.model is not None and config.preset is None:
+        world = training_world(source.model)
+    counts = {
+        name: getattr(config, name) for name in ("num_agents", "num_obstacles") if getattr(config, name) is not None
+    }
+    world = replace(world, scenes=config.scenes, steps=config.steps, seed=config.seed, engine=config.engine, **counts)
+    return Stage.of(world), reference
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "-", name).strip("-")
+
+
+def _videos(folder: Path, judgement: Judgement, count: int) -> None:
+    """Of the worst scenes: reference and policy side by side, or the policy alone."""
+    with progress("videos") as update:
+        if judgement.reference is not None:
+            make_videos(folder, count, progress=update)
+            return
+        for number, worst in enumerate(judgement.worst[:count]):
+            out = folder / "videos" / f"worst-{number + 1}-scene-{worst.scene:04d}.mp4"
+            make_video([folder / "rollouts" / "learned.h5"], out, scenes=[worst.scene], titles=[judgement.policy])
+            update(number + 1, count)
 
 
 def as_results(judgement: Judgement) -> Results:
@@ -40,10 +93,11 @@ def as_results(judgement: Judgement) -> Results:
         for kind in ("published_mean", "published_median", "agents_mean", "agents_median"):
             for horizon, value in zip(error.horizons, getattr(error, kind), strict=True):
                 rows.append(Row(name, f"{kind} {horizon} steps", value, unit="normalized MSE"))
-    for name, report in judgement.collisions.items():
-        for figure, estimate in report.items():
-            rows.append(Row(name, figure, estimate.value, unit=estimate.unit))
-            for end in ("low", "high"):
-                if (bound := getattr(estimate, end)) is not None:
-                    rows.append(Row(name, f"{figure} {end}", bound, unit=estimate.unit))
+    for reports in (judgement.collisions, judgement.collective):
+        for name, report in reports.items():
+            for figure, estimate in report.items():
+                rows.append(Row(name, figure, estimate.value, unit=estimate.unit))
+                for end in ("low", "high"):
+                    if (bound := getattr(estimate, end)) is not None:
+                        rows.append(Row(name, f"{figure} {end}", bound, unit=estimate.unit))
     return Results(name="evaluate", rows=rows, dt=judgement.dt, seeds=[judgement.seed])

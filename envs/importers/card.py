@@ -1,0 +1,152 @@
+"""The card of an imported data set: source, licence, units, counts, figures, gaps, outliers and the command."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from envs.importers.config import ImportConfig
+from envs.importers.samples import Samples
+from envs.importers.scenes import Scene
+from envs.importers.survey import Survey
+from envs.plain import plain
+
+LISTED = 1000
+"""Gaps that the card lists; all are counted."""
+KEPT = 50
+"""Files, gaps and outliers that provenance lists: HDF5 attributes are small."""
+
+
+def card(
+    *,
+    sources: Sequence[dict],
+    config: ImportConfig,
+    dt: float,
+    runs: Sequence[Samples],
+    figures: Survey,
+    divided: str,
+    command: str,
+) -> dict:
+    """What holds for the whole import, plain JSON."""
+    gaps = [gap for run in runs for gap in run.gaps]
+    about = {key: value for key, value in asdict(figures).items() if key not in ("outliers", "outlying", "thresholds")}
+    return {
+        "source": config.source,
+        "licence": config.licence,
+        "command": command,
+        "files": list(sources),
+        "dt": dt,
+        "options": plain(config),
+        "runs": len(runs),
+        "agents": sum(len(np.unique(run.person[run.agents])) for run in runs),
+        "seconds": float(sum((run.rows - 1) * dt for run in runs)),
+        "agent_rows": int(sum(run.agents.sum() for run in runs)),
+        "figures": about,
+        "gaps": {
+            "policy": config.gap,
+            "count": len(gaps),
+            "bridged": sum(gap.bridged for gap in gaps),
+            "longest": max((gap.length for gap in gaps), default=0.0),
+            "listed": [asdict(gap) for gap in gaps[:LISTED]],
+        },
+        "outliers": {
+            "thresholds": {what: "none" if value == np.inf else value for what, value in figures.thresholds.items()},
+            "count": figures.outlying,
+            "listed": [asdict(outlier) for outlier in figures.outliers],
+        },
+        "division": divided,
+    }
+
+
+def part(name: str, runs: Sequence[Samples], scenes: Sequence[Scene], rows: int) -> dict:
+    """What holds for one file of the import: the training part, the held-out part, or everything."""
+    return {
+        "part": name,
+        "part_runs": len(runs),
+        "part_agents": sum(len(np.unique(run.person[run.agents])) for run in runs),
+        "scenes": len(scenes),
+        "rows_per_scene": rows,
+    }
+
+
+def brief(about: dict) -> dict:
+    """The card for the file's provenance: long lists are cut."""
+    short = {what: about[what] | {"listed": about[what]["listed"][:KEPT]} for what in ("gaps", "outliers")}
+    return about | short | {"files": about["files"][:KEPT], "number_of_files": len(about["files"])}
+
+
+def echo(about: dict) -> str:
+    """The lines that show a wrong unit or frame rate at a glance."""
+    figures, dt = about["figures"], about["dt"]
+    low, median, high = figures["speed"]
+    lines = [
+        f"{about['runs']} runs, {about['agents']} agents, {about['seconds']:.6g} s, rows {dt:g} s apart; "
+        f"{figures['present'][1]:g} agents at a time (at most about {figures['present'][2]:g})",
+        f"median speed {median:.3g} m/s = {3.6 * median:.3g} km/h (1% to 99%: {low:.3g} to {high:.3g} m/s), median "
+        f"acceleration {figures['acceleration'][1]:.3g} m/s^2",
+    ]
+    if figures["spacing"]:
+        low, median, high = figures["spacing"]
+        lines.append(f"median distance to the nearest other {median:.3g} m (1% to 99%: {low:.3g} to {high:.3g} m)")
+    facts: dict[tuple, list[str]] = {}
+    for source in about["files"]:
+        facts.setdefault(tuple(source["facts"].items()), []).append(source["name"])
+    for fact, names in facts.items():
+        some = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        lines.append(f"{some}: " + "; ".join(f"{key}: {value}" for key, value in fact))
+    gaps, outliers = about["gaps"], about["outliers"]
+    if gaps["count"]:
+        lines.append(
+            f"{gaps['count']} gaps, {gaps['bridged']} bridged, the longest {gaps['longest']:.3g} s "
+            f"(policy {gaps['policy']})"
+        )
+    limits = ", ".join(f"{what} above {_figure(value)}" for what, value in outliers["thresholds"].items())
+    lines.append(f"{outliers['count']} outliers ({limits}), kept" + (": see the card" if outliers["count"] else ""))
+    lines.append(about["division"])
+    return "\n".join(lines)
+
+
+def render(about: dict, name: str) -> str:
+    """The card as a Markdown page for the file `name`."""
+    lines = [
+        f"# {name}",
+        "",
+        f"Source: {about['source'] or 'not declared (--source)'}",
+        f"Licence: {about['licence'] or 'not declared (--licence)'}",
+        "",
+        f"{about['part'].capitalize()}: {about['part_runs']} runs, {about['part_agents']} agents, "
+        f"{about['scenes']} scenes of {about['rows_per_scene']} rows.",
+        "",
+        "```",
+        echo(about),
+        "```",
+        "",
+        "Figures are of all parts together.",
+        "",
+        "Written by",
+        "",
+        f"    {about['command'] or 'envs.importers.import_files'}",
+        "",
+        "| file | bytes | sha256 |",
+        "|---|---:|---|",
+        *(f"| {file['name']} | {file['bytes']} | {file['sha256']} |" for file in about["files"]),
+    ]
+    for what, columns in (
+        ("gaps", ("run", "id", "start", "length", "bridged")),
+        ("outliers", ("run", "id", "time", "what", "value")),
+    ):
+        entries = about[what]["listed"]
+        if entries:
+            lines += [
+                "",
+                f"## {what.capitalize()}: {len(entries)} of {about[what]['count']}",
+                "",
+                "| " + " | ".join(columns) + " |",
+                "|" + "---|" * len(columns),
+                *("| " + " | ".join(_figure(entry[column]) for column in columns) + " |" for entry in entries),
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def _figure(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
