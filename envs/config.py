@@ -250,6 +250,12 @@ class SimulateConfig:
     """Standard deviation of what is added to everything the expert sees [m and m/s]; 1 in the thesis."""
     actuation_noise: float = 0.0
     """Standard deviation of what is added to its accelerations [m/s^2]."""
+    targets: int | None = None
+    """Chasers: how many others each one chases; the preset's own by default, 1."""
+    assignment: str | None = None
+    """Chasers: `fixed`, exactly `targets`; `scene` or `agent`, uniform in 1..targets for each scene or each agent."""
+    average: bool = False
+    """Chasers: go for the targets' average position (the thesis's text), not the sum of displacements (its code)."""
     engine: str = "auto"
     """`native` (C on threads), `mjx` (XLA), or `auto`: mjx on a GPU or TPU, native elsewhere."""
     threads: int = 0
@@ -288,7 +294,24 @@ class SimulateConfig:
         if self.interaction_radius is not None or self.nearest is not None:
             seen = Interaction(radius=self.interaction_radius, nearest=self.nearest)
             expert = replace(expert, interaction=seen)
+        if self.targets is not None or self.assignment is not None or self.average:
+            start, expert = self._chase(start, expert)
         return World(scene, start, expert)
+
+    def _chase(self, start: SpawnConfig, expert: ExpertConfig) -> tuple[SpawnConfig, ExpertConfig]:
+        if not isinstance(expert, ChaserConfig):
+            given = {"targets": self.targets, "assignment": self.assignment, "average": self.average}
+            field, value = next((name, value) for name, value in given.items() if value not in (None, False))
+            raise SpecError(field, value, "nothing: it is for preset chaser")
+        if self.targets is not None:
+            if not 1 <= self.targets < max(self.num_agents, 2):
+                raise SpecError("targets", self.targets, f"from 1 to num_agents - 1 = {self.num_agents - 1}")
+            start = replace(start, targets=self.targets)
+        if self.assignment is not None:
+            if self.assignment not in ASSIGNMENTS:
+                raise SpecError("assignment", self.assignment, "one of " + ", ".join(ASSIGNMENTS))
+            start = replace(start, assignment=self.assignment)
+        return start, replace(expert, average=self.average)
 
 
 def only(expert: ExpertConfig, rules: tuple[str, ...]) -> ExpertConfig:

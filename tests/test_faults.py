@@ -225,7 +225,7 @@ def test_an_interrupted_simulation_goes_on(tmp_path: Path, monkeypatch, capsys):
     """Interrupted after two of three chunks: the same command makes the third alone, and the same file."""
     import envs.simulate as module
 
-    command = (*SIMULATE, "--num-agents", "3", "--chunk", "2", "--scenes", "6")
+    command = (*SIMULATE, "--num-agents", "3", "--chunk", "256", "--scenes", "520")  # blocks of 256
     assert main((*command, "--out", str(tmp_path / "whole.h5"))) == 0
     original, made = module.save, []
 

@@ -13,7 +13,7 @@ from helpers import assert_same_trajectories
 
 from envs import simulate as simulation
 from envs.config import SimulateConfig, clear
-from envs.experts.config import Interaction
+from envs.experts.config import ChaserConfig, Interaction
 from envs.plain import from_plain, plain
 from envs.simulate import block_of, fingerprint, simulate, simulate_in_memory
 from envs.storage import load, save
@@ -306,3 +306,25 @@ def test_settings_written_before_a_field_existed_are_read_with_its_default():
 class WithoutDefault:
     agents: int
     scenes: int = 1
+
+
+def test_chasers_have_the_targets_that_were_asked_for():
+    world = SimulateConfig(preset="chaser", num_agents=6, targets=3, assignment="agent", average=True).world()
+    assert (world.spawn.targets, world.spawn.assignment) == (3, "agent")
+    assert world.expert == ChaserConfig(average=True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        ({"preset": "chaser", "num_agents": 3, "targets": 3}, "targets"),
+        ({"preset": "chaser", "targets": 0}, "targets"),
+        ({"preset": "chaser", "assignment": "random"}, "assignment"),
+        ({"preset": "clear", "targets": 1}, "targets"),
+        ({"preset": "clear", "average": True}, "average"),
+    ],
+)
+def test_targets_that_make_no_sense_are_refused(settings: dict, field: str):
+    with pytest.raises(SpecError) as caught:
+        SimulateConfig(**settings)
+    assert caught.value.field == field
