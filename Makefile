@@ -18,8 +18,8 @@ setup:  ## Create or complete .venv (PYTHON=... names a Python to try first)
 demo: setup  ## Run the demonstration: ARGS go to `swarmnet demo`
 	@$(BIN)/swarmnet demo $(ARGS)
 
-test: setup  ## Run the tests: ARGS go to pytest
-	@$(BIN)/pytest $(ARGS)
+test: setup  ## Run the tests on all cores: ARGS go to pytest
+	@$(BIN)/pytest -n logical --maxprocesses 8 --dist worksteal $(ARGS)
 
 check: setup  ## Format, lint, check types and imports (with CI=true: only check the format)
 	@$(BIN)/ruff format $(if $(filter true,$(CI)),--check)

@@ -53,9 +53,14 @@ def simulate_chunks(config: SimulateConfig, skip: frozenset[range] = frozenset()
 
 def make_policy(config: SimulateConfig) -> Policy:
     """The expert of the configuration's world, with its noise."""
+    return with_noise(make_expert(config.world().expert), config)
+
+
+def with_noise(policy: Policy, config: SimulateConfig) -> Policy:
+    """Any policy with the configuration's noise on what it perceives and does."""
     seen = PerceptionNoise(position=config.perception_noise, velocity=config.perception_noise)
     done = ActuationNoise(std=config.actuation_noise)
-    return with_actuation_noise(with_perception_noise(make_expert(config.world().expert), seen), done)
+    return with_actuation_noise(with_perception_noise(policy, seen), done)
 
 
 def block_of(config: SimulateConfig) -> int:

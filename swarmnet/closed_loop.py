@@ -14,6 +14,7 @@ from envs.plain import from_plain, plain
 from envs.record import Array
 from envs.replay import replay, touching_pairs
 from envs.rollout import Recording, make_rollout
+from envs.simulate import with_noise
 from envs.state import State, make_state, park
 from envs.swarm_env import SwarmEnv, scene_keys
 from envs.touching import Touches
@@ -40,7 +41,7 @@ class Stage:
     """Control steps."""
     seed: int
     simulate: SimulateConfig | None = None
-    """The configuration that the world is of."""
+    """The configuration that the world is of; its noise is on every policy that is judged."""
     starts: State | None = None
     """Starting states of all scenes; None: drawn from the seed."""
 
@@ -121,6 +122,8 @@ def roll_out(stage: Stage, source: Source, *, title: str, log: ContactLogWriter 
                     policy = checked(
                         source.name, policy, params, jax.tree.map(lambda x: x[:TRIED], start), keys[:TRIED]
                     )
+                if stage.simulate is not None:
+                    policy = with_noise(policy, stage.simulate)
                 run = make_rollout(env, policy, steps=stage.steps)
             try:
                 recording = jax.device_get(run(params, start, keys))

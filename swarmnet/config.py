@@ -114,8 +114,12 @@ class Evaluate:
     """Largest number of agents per scene; the world's own by default."""
     num_obstacles: int | None = None
     """Largest number of obstacles per scene; the world's own by default."""
+    perception_noise: float | None = None
+    """Standard deviation of noise on all that both policies see [m and m/s]; that of the training data by default."""
+    actuation_noise: float | None = None
+    """Standard deviation of noise on both policies' accelerations [m/s^2]; that of the training data by default."""
     engine: str = "auto"
-    """Physics engine: auto, native, mjx."""
+    """Physics engine: auto, native, mjx, mjx-warp."""
     log: Literal["csv", "parquet"] = "csv"
     """Format of the contact log."""
     videos: int = 3

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,15 @@ from learning import quick_training
 
 from envs.collective import UNITS
 from envs.collisions import collision_report
+from envs.config import SimulateConfig
 from envs.contact_log import COLUMNS, load_log
 from envs.estimates import Estimate
 from envs.replay import replay
+from envs.simulate import simulate_in_memory
 from envs.storage import load, save
 from swarmnet.cli import main
+from swarmnet.closed_loop import Stage, roll_out
+from swarmnet.policies import find_policy
 
 SMALL = ("--scenes", "6", "--steps", "10", "--videos", "0", "--engine", "native")
 LAW = """
@@ -221,3 +226,11 @@ def shortened(text: str) -> list[tuple[str, str]]:
             stem = first.rsplit("_", 1)[0]
             found += [(stem, end) for end in (first.removeprefix(stem), *ends)]
     return found
+
+
+def test_the_noise_of_the_world_is_on_whoever_is_judged():
+    config = SimulateConfig(preset="published", scenes=4, steps=5, num_agents=3, actuation_noise=2.0, engine="native")
+    noisy = roll_out(Stage.of(config), find_policy("expert"), title="noisy")
+    np.testing.assert_allclose(noisy.position, simulate_in_memory(config).position, atol=1e-3)
+    quiet = roll_out(Stage.of(replace(config, actuation_noise=0.0)), find_policy("expert"), title="quiet")
+    assert np.abs(noisy.position - quiet.position).max() > 0.1

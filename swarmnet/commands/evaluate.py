@@ -63,10 +63,9 @@ def _stage(config: Evaluate, source: Source, reference: Source | None) -> tuple[
     world = SimulateConfig(preset=config.preset) if config.preset else SimulateConfig()
     if source.model is not None and config.preset is None:
         world = training_world(source.model)
-    counts = {
-        name: getattr(config, name) for name in ("num_agents", "num_obstacles") if getattr(config, name) is not None
-    }
-    world = replace(world, scenes=config.scenes, steps=config.steps, seed=config.seed, engine=config.engine, **counts)
+    own = ("num_agents", "num_obstacles", "perception_noise", "actuation_noise")
+    asked = {name: getattr(config, name) for name in own if getattr(config, name) is not None}
+    world = replace(world, scenes=config.scenes, steps=config.steps, seed=config.seed, engine=config.engine, **asked)
     return Stage.of(world), reference
 
 
