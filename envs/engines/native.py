@@ -201,7 +201,7 @@ class NativeEngine:
             rows = np.flatnonzero(touched | near)
             if len(rows):
                 look.state[rows] = batch.state[rows]
-                look.forward(ids=rows, stage=mujoco.mjtStage.mjSTAGE_VEL.value)  # state k
+                look.forward(ids=rows, stage=mujoco.mjtStage.mjSTAGE_POS.value)  # state k
                 sensors = np.concatenate([recorded[rows], look.sensordata[rows, None]], axis=1)
                 before = (flags[rows, :, 0], flags[rows, :, 2:], flags[rows, :, 1])
                 (agent, solid, wall), on_agent, fields = read_sensors(np, sensors, before, index, self.spec)
@@ -242,7 +242,7 @@ class NativeEngine:
         positions = recorded[rows[scene], substep][:, self._index.qpos].reshape(-1, agents, 2)
         row = np.arange(len(agent))
         apart = positions - positions[row, agent][:, None]
-        distance = np.hypot(apart[..., 0], apart[..., 1])
-        distance[row, agent] = np.inf
-        np.maximum.at(depth, (scene, agent), np.maximum(2 * self.spec.agent_radius - distance.min(axis=1), 0))
+        square = apart[..., 0] ** 2 + apart[..., 1] ** 2
+        square[row, agent] = np.inf
+        np.maximum.at(depth, (scene, agent), np.maximum(2 * self.spec.agent_radius - np.sqrt(square.min(axis=1)), 0))
         return depth

@@ -80,7 +80,8 @@ def echo(about: dict) -> str:
     figures, dt = about["figures"], about["dt"]
     low, median, high = figures["speed"]
     lines = [
-        f"{about['runs']} runs, {about['agents']} agents, {about['seconds']:.6g} s, rows {dt:g} s apart; "
+        f"{about['runs']} {'run' if about['runs'] == 1 else 'runs'}, {about['agents']} agents, "
+        f"{about['seconds']:.6g} s, rows {dt:g} s apart; "
         f"{figures['present'][1]:g} agents at a time (at most about {figures['present'][2]:g})",
         f"median speed {median:.3g} m/s = {3.6 * median:.3g} km/h (1% to 99%: {low:.3g} to {high:.3g} m/s), median "
         f"acceleration {figures['acceleration'][1]:.3g} m/s^2",
