@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+import pytest
 from helpers import scene_state
 
 from envs.config import make_world
@@ -63,9 +64,9 @@ def test_the_same_crash_without_contacts_passes_through_unseen():
     assert not depth.any()
 
 
-def contact_share(preset: str, *, scenes: int, **changes: object) -> float:
+def contact_share(preset: str, *, scenes: int, num_obstacles: int = 1, **changes: object) -> float:
     """Share of control steps in which any agent of the scene touches anything."""
-    world = make_world(preset)
+    world = make_world(preset, num_obstacles=num_obstacles)
     env = SwarmEnv(replace(world.scene, **changes), engine="native", spawn=world.spawn, horizon=60)
     keys = scene_keys(1, range(scenes))
     run = make_rollout(env, make_expert(world.expert), steps=60)
@@ -73,8 +74,9 @@ def contact_share(preset: str, *, scenes: int, **changes: object) -> float:
     return float((contacts.agent_states + contacts.obstacle_states).any(axis=2).mean())
 
 
-def test_the_clear_preset_touches_in_less_than_one_step_of_a_thousand():
-    assert contact_share("clear", scenes=300) < 1e-3
+@pytest.mark.parametrize("num_obstacles", [1, 3])
+def test_the_clear_preset_touches_in_less_than_one_step_of_a_thousand(num_obstacles: int):
+    assert contact_share("clear", scenes=400, num_obstacles=num_obstacles) < 1e-3
 
 
 def test_the_published_rules_with_bodies_touch_much_of_the_time():
