@@ -257,7 +257,7 @@ class SimulateConfig:
     average: bool = False
     """Chasers: go for the targets' average position (the thesis's text), not the sum of displacements (its code)."""
     engine: str = "auto"
-    """`native` (C on threads), `mjx` (XLA), or `auto`: mjx on a GPU or TPU, native elsewhere."""
+    """`native` (C on threads), `mjx` (XLA), `mjx-warp` (CUDA), or `auto`: mjx on a GPU or TPU, else native."""
     threads: int = 0
     """Threads of the native engine; 0 takes every CPU."""
     chunk: int = 1024

@@ -209,7 +209,7 @@ class Demo:
     seed: int = 0
     """Seed of data and weights."""
     engine: str = "auto"
-    """Physics engine: auto, native, mjx."""
+    """Physics engine: auto, native, mjx, mjx-warp."""
     videos: int = 3
     """Scenes to make videos of."""
 

@@ -31,5 +31,5 @@ def __getattr__(name: str) -> Any:
         if library not in _EXTRAS:
             raise
         raise SwarmError(
-            f"{name} needs {library}, which is not installed: pip install 'swarmnet-mujoco[{library}]'"
+            f"{name} needs {library}, which is not installed: pip install -e '.[{library}]' in the project's folder"
         ) from error

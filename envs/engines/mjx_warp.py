@@ -28,8 +28,8 @@ from swarm_mjcf.spec import SceneSpec
 
 if importlib.util.find_spec("warp") is None:
     raise EngineError(
-        "the engine mjx-warp is not installed: pip install 'swarmnet-mujoco[warp]' (390 MB on disk; for machines with "
-        "an NVIDIA GPU, on others it runs slowly)"
+        "the engine mjx-warp is not installed: pip install -e '.[warp]' in the project's folder (390 MB "
+        "on disk; for machines with an NVIDIA GPU, on others it runs slowly)"
     )
 with contextlib.redirect_stdout(io.StringIO()):  # it greets where a program's output belongs
     from mujoco import mjx

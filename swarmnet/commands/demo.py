@@ -1,6 +1,7 @@
 """`swarmnet demo`: the main job, each part kept when it is done."""
 
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -61,7 +62,9 @@ def run(config: Demo) -> int:
     print(summary(json.loads(judged.read_text()), f"swarmnet {config.model}"))
     print(f"\n{report}  <- open this: figures, tables and videos ({time.monotonic() - started:.0f} s)")
     print(f"videos: {folder / 'videos'}   data: {folder / 'data.h5'}   metrics: {folder / 'metrics.jsonl'}")
-    print(f"next: swarmnet evaluate {folder} --scenes 1000 --seed 7   or   swarmnet --help")
+    # As it was called: `make demo` leaves no `swarmnet` on the search path.
+    program = sys.argv[0] if Path(sys.argv[0]).name == "swarmnet" else "swarmnet"
+    print(f"next: {program} evaluate {folder} --scenes 1000 --seed 7   or   {program} --help")
     return 0
 
 
