@@ -19,12 +19,12 @@ def test_throughput_counts_real_contacts_and_names_what_it_ran():
 
 def test_the_command_writes_the_common_format(tmp_path, capsys):
     file = tmp_path / "throughput.json"
-    arguments = ["--engine", "native", "--batch", "4", "--substeps", "1", "--json", str(file)]
+    arguments = ["--engine", "native", "--batch", "4", "--substeps", "2", "--json", str(file)]
     assert main(["bench", "throughput", *arguments]) == 0
     printed = capsys.readouterr().out
     document = json.loads(file.read_text())
     assert document["name"] == "bench-throughput"
     cells = {(row["row"], row["column"]): row["value"] for row in document["rows"]}
-    rate = cells["native", "S=4 k=1 scene-steps/s"]
-    assert cells["native", "S=4 k=1 physics steps/s"] == pytest.approx(rate)
-    assert f"throughput.native.s4.k1.scene_steps_s {rate:.4g}" in printed
+    rate = cells["native", "S=4 k=2 scene-steps/s"]
+    assert cells["native", "S=4 k=2 physics steps/s"] == pytest.approx(2 * rate)
+    assert f"throughput.native.s4.k2.scene_steps_s {rate:.4g}" in printed

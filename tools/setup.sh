@@ -136,7 +136,7 @@ if ! is_stamped .venv/packages.stamp "$(packages_from)"; then
     find_python
     say "Setting up .venv with $("$python" -V), $python"
     "$python" -m venv --clear .venv
-    say "Installing the packages of requirements.lock: a minute or so plus the download, 1.5 GB on disk."
+    say "Installing the packages of requirements.lock: a minute or so plus the download, 2 GB on disk."
     # The lock is complete, so nothing is resolved: --no-deps keeps pip from asking for what the lock leaves out.
     pip_install --require-hashes --no-deps -r requirements.lock
     packages_from >.venv/packages.stamp
