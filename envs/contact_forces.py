@@ -18,7 +18,7 @@ from envs.dynamics import limited
 from envs.engines.engine import obstacle_path
 from envs.policy import Policy
 from envs.record import Array
-from envs.rollout import Recording
+from envs.rollout import Recording, step_keys
 from envs.state import State
 from envs.swarm_env import SwarmEnv
 from envs.touching import BY_AGENT, BY_OBSTACLE, BY_WALL, Touches
@@ -130,7 +130,7 @@ def _starts(
 
     @jax.jit
     def accelerate(state: State, keys: Key[Array, " S"]) -> tuple[Array, Array]:
-        wanted = policy(state, params, jax.vmap(jax.random.fold_in)(keys, state.step))
+        wanted = policy(state, params, step_keys(keys, state.step))
         wanted = jnp.where(state.agent_present[..., None], wanted, 0)
         return limited(state.velocity, wanted, env.spec), obstacle_path(state, env.spec)
 

@@ -4,7 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Key
+from jaxtyping import Float, Int, Key
 
 from envs.policy import Policy
 from envs.record import Array, record
@@ -26,17 +26,26 @@ class Recording:
     """Obstacles' positions [m] at steps 0..T; None: they stood still where `start` has them."""
 
 
+_POLICY = 2**31
+"""Sets the policy's keys apart from those of the start, which come from the same key of the scene by small numbers."""
+
+
+def step_keys(keys: Key[Array, " S"], step: Int[Array, "*S"]) -> Key[Array, " S"]:
+    """The keys that a policy gets at a control step (of all scenes, or each its own), from the scenes' keys."""
+    each = jnp.broadcast_to(jnp.asarray(step, jnp.int32), keys.shape)
+    return jax.vmap(lambda key, t: jax.random.fold_in(jax.random.fold_in(key, _POLICY), t))(keys, each)
+
+
 def rollout(
     env: SwarmEnv, policy: Policy, params: object, start: State, keys: Key[Array, " S"], *, steps: int
 ) -> Recording:
     """Runs `policy` for `steps` control steps from `start`; pure, for use inside `jit` (see `make_rollout`).
 
-    The policy is called as `policy(state, params, step_keys)` with one key per scene.
+    The policy is called as `policy(state, params, step_keys(keys, t))` with one key per scene.
     """
 
     def step(state: State, t: Array):
-        step_keys = jax.vmap(partial(jax.random.fold_in, data=t))(keys)
-        transition = env.step(state, policy(state, params, step_keys))
+        transition = env.step(state, policy(state, params, step_keys(keys, t)))
         return transition.state, (seen(transition.state), transition.contacts)
 
     def seen(state: State) -> dict[str, Array]:

@@ -78,6 +78,8 @@ def stage_of_recording(recording: Trajectories, *, preset: str | None, engine: s
         ) from error
     if abs(world.scene.dt - t.dt) > 1e-9:
         raise SwarmError(f"the recording has a row every {t.dt:g} s, the world a control step of {world.scene.dt:g} s")
+    if world.spawn.targets:
+        raise SwarmError("recordings do not hold who chases whom, so no chaser can be run from their first row")
     if (t.mask != t.mask[:, :1]).any():
         raise SwarmError("agents enter or leave during the recording, so no policy can be run from its first row")
     goals, obstacles, agents = (np.flatnonzero(t.kind[0] == kind) for kind in (GOAL, OBSTACLE, AGENT))

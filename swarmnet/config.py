@@ -277,6 +277,12 @@ class Bench:
     json: Path | None = None
     """Also write the results here, machine-readable."""
 
+    def __post_init__(self) -> None:
+        for field in ("repeats", "scenes", "agents", "substeps", "batch"):
+            value = getattr(self, field)
+            if any(number < 1 for number in (value if isinstance(value, tuple) else (value,))):
+                raise SpecError(field, value, "at least 1")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Import(ImportConfig):

@@ -123,8 +123,9 @@ def judge_policy(
       SwarmError: the scenes are those of a model's training data, its dt is not the world's, recordings do not hold the
         same number of scenes, rows and nodes, or a policy cannot be used.
     """
-    if source.model is not None:
-        _check_model(source.model, stage)
+    for one in (source, reference):
+        if one is not None and one.model is not None:
+            _check_model(one.model, stage)
     if reference is not None and not reference.acts and reference.recording is None:
         raise SwarmError(f"{reference.given}: predicts changes of state, so it cannot be a reference in closed loop")
     if reference is not None and reference.name == source.name:

@@ -103,15 +103,14 @@ def crowd() -> SwarmCore:
 
 def test_the_discount_tells_termination_from_truncation(crowd: SwarmCore):
     still = np.zeros((3, 2), np.float32)
-    step = None
-    env = SwarmDmEnv(make_core(**WORLD | {"terminate_on_contact": False}))
-    env.reset()
-    for _ in range(6):
-        step = env.step(still)
-    assert step is not None
-    assert step.last()
-    assert step.discount == 1.0
-    assert env.step(still).step_type is dm_env.StepType.FIRST
+    # Horizon 7: 7 * 0.3 s are a little more than 7 steps in floating point.
+    core = make_core(**WORLD | {"terminate_on_contact": False, "horizon": 7})
+    for env in (SwarmDmEnv(core), control_environment(core)):
+        env.reset()
+        steps = [env.step(still) for _ in range(7)]
+        assert [step.last() for step in steps] == [False] * 6 + [True]
+        assert steps[-1].discount == 1.0
+        assert env.step(still).step_type is dm_env.StepType.FIRST
     for env in (SwarmDmEnv(crowd), control_environment(crowd)):
         discounts = set()
         for _ in range(12):

@@ -234,3 +234,10 @@ def test_the_noise_of_the_world_is_on_whoever_is_judged():
     np.testing.assert_allclose(noisy.position, simulate_in_memory(config).position, atol=1e-3)
     quiet = roll_out(Stage.of(replace(config, actuation_noise=0.0)), find_policy("expert"), title="quiet")
     assert np.abs(noisy.position - quiet.position).max() > 0.1
+
+
+@pytest.mark.parametrize("option", ["num-agents", "num-obstacles", "perception-noise", "actuation-noise"])
+def test_options_that_a_recording_cannot_follow_are_refused(option: str, there: Path, capsys):
+    recorded = str(there / "rollouts" / "learned.h5")
+    assert main(["evaluate", "--policy", recorded, f"--{option}", "1"]) == 2
+    assert f"{option.replace('-', '_')}: 1" in capsys.readouterr().err

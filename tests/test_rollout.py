@@ -10,7 +10,7 @@ from helpers import assert_same, scenes_of
 
 from envs.config import clear
 from envs.experts.registry import make_expert
-from envs.rollout import make_rollout
+from envs.rollout import make_rollout, step_keys
 from envs.swarm_env import SwarmEnv, scene_keys
 
 WORLD = clear(num_agents=3)
@@ -71,3 +71,16 @@ def test_one_compile_per_number_of_scenes_whatever_the_parameters(env: SwarmEnv)
         keys = scene_keys(len(traced), range(scenes))
         run({"gain": jnp.float32(len(traced))}, env.reset(keys), keys)
     assert traced == [4, 7]
+
+
+def test_a_policys_keys_are_none_of_those_that_drew_the_start():
+    """Spawning splits and folds the same key of the scene: noise would repeat the start's numbers."""
+    keys = scene_keys(0, range(3))
+    start = [jax.random.split(keys[0], 6)[i] for i in range(6)] + [jax.random.fold_in(keys[0], i) for i in range(64)]
+    steps = [step_keys(keys, jnp.asarray(t))[0] for t in range(64)]
+    data = [tuple(np.asarray(jax.random.key_data(key)).tolist()) for key in [*start, *steps]]
+    assert not set(data[: len(start)]) & set(data[len(start) :])
+    assert len(set(data[len(start) :])) == 64
+    each = step_keys(keys, jnp.asarray([5, 2, 7]))
+    for scene, t in enumerate((5, 2, 7)):
+        assert each[scene] == step_keys(keys, jnp.asarray(t))[scene]

@@ -122,9 +122,11 @@ class SwarmTask(control.Task):
         return self._earned
 
     def get_termination(self, physics: SwarmPhysics) -> float | None:  # type: ignore[override]
-        """Discount 0 where a contact ends the scene, if `terminate_on_contact` is set; None while it goes on."""
+        """Discount 0 where a contact ends the scene, if `terminate_on_contact` is set, 1 at the horizon, else None."""
         touched = (self.contacts.agent_states, self.contacts.obstacle_states, self.contacts.wall_states)
-        return 0.0 if self.core.env.terminate_on_contact and any(map(np.any, touched)) else None
+        if self.core.env.terminate_on_contact and any(map(np.any, touched)):
+            return 0.0
+        return 1.0 if int(self.state.step[0]) >= self.core.env.horizon else None
 
     def action_spec(self, physics: SwarmPhysics) -> specs.BoundedArray:  # type: ignore[override]
         """(N, 2) float32 in [-1, 1]."""
@@ -141,7 +143,10 @@ class SwarmTask(control.Task):
 
 
 def control_environment(core: SwarmCore, *, seed: int = 0) -> control.Environment:
-    """The core's scene as a `dm_control.rl.control.Environment`; its horizon is the time limit."""
-    dt = core.spec.dt
+    """The core's scene as a `dm_control.rl.control.Environment`; the task counts the steps of the horizon.
+
+    (dm_control's time limit is a division of floats, a step too long at some horizons, and hides a contact in the last
+    step.)
+    """
     physics, task = SwarmPhysics.of(core.spec), SwarmTask(core, seed=seed)
-    return control.Environment(physics, task, time_limit=core.env.horizon * dt, control_timestep=dt)
+    return control.Environment(physics, task, control_timestep=core.spec.dt)

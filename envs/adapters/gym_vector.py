@@ -59,11 +59,13 @@ class SwarmVectorEnv(VectorEnv):
         """First observations of all scenes."""
         super().reset(seed=seed)
         scenes = np.arange(self.num_envs)
-        if seed is not None or self._seed is None:
-            self._seed = int(self.np_random.integers(SEEDS)) if seed is None else int(seed)
+        series = self._seed
+        if seed is not None or series is None:
+            series = int(self.np_random.integers(SEEDS)) if seed is None else int(seed)
         elif self._episodes is not None:
             scenes = np.asarray(self._episodes.scene).astype(np.int64) + self.num_envs
-        self._episodes, outcome = self.core.start(self._seed, self._chosen(options, scenes))
+        self._episodes, outcome = self.core.start(series, self._chosen(options, scenes))  # refuses what cannot be
+        self._seed = series
         outcome = _own(outcome)
         return np.asarray(outcome.observation), _masked(infos(outcome), np.ones(self.num_envs, bool))
 

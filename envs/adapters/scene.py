@@ -30,10 +30,12 @@ class OneScene:
     def reset(self, seed: int | None, *, rng: np.random.Generator, scene: int | None = None) -> Outcome:
         """Starts the next scene; a `seed` starts its series anew, and `rng` draws one where none was ever given."""
         if seed is not None or self._seed is None:
-            self._seed, self._next = int(rng.integers(SEEDS) if seed is None else seed), 0
-        number = self._next if scene is None else scene
-        self._episodes, outcome = self.core.start(self._seed, np.asarray([number]))
-        self._next = number + 1
+            series, number = int(rng.integers(SEEDS) if seed is None else seed), 0
+        else:
+            series, number = self._seed, self._next
+        number = number if scene is None else scene
+        self._episodes, outcome = self.core.start(series, np.asarray([number]))  # refuses what cannot be
+        self._seed, self._next = series, number + 1
         return _only(outcome)
 
     def step(self, action: Any) -> Outcome:

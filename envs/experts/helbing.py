@@ -22,7 +22,8 @@ def helbing(config: HelbingConfig) -> Policy:
     def policy(state: State, params: object = None, key: object = None) -> Vectors:
         total = jnp.zeros_like(state.position)
         for name, force in forces(state, config).items():
-            total = total + getattr(config, name) * force
+            if getattr(config, name):  # 0 times the infinity of a force that overflows would be NaN
+                total = total + getattr(config, name) * force
         if config.goal:
             total = total + config.goal * _goal(state, config)
         return jnp.where(state.agent_present[..., None], total, 0)

@@ -48,6 +48,11 @@ def _stage(config: Evaluate, source: Source, reference: Source | None) -> tuple[
     both = [one for one in (source, reference) if one is not None]
     recording = next((one.recording for one in both if one.recording is not None), None)
     if recording is not None:
+        for field in ("num_agents", "num_obstacles", "perception_noise", "actuation_noise"):
+            if getattr(config, field) is not None:
+                raise SpecError(
+                    field, getattr(config, field), "nothing beside recorded trajectories: they have their own"
+                )
         options = {"preset": config.preset, "engine": config.engine, "seed": config.seed}
         if any(one.make is not None or one.model is not None for one in both):
             try:
@@ -61,8 +66,9 @@ def _stage(config: Evaluate, source: Source, reference: Source | None) -> tuple[
         stage = Stage.of(SimulateConfig(scenes=len(recording), steps=max(1, recording.position.shape[1] - 1)))
         return replace(stage, simulate=None), reference
     world = SimulateConfig(preset=config.preset) if config.preset else SimulateConfig()
-    if source.model is not None and config.preset is None:
-        world = training_world(source.model)
+    model = next((one.model for one in both if one.model is not None), None)
+    if model is not None and config.preset is None:
+        world = training_world(model)
     own = ("num_agents", "num_obstacles", "perception_noise", "actuation_noise")
     asked = {name: getattr(config, name) for name in own if getattr(config, name) is not None}
     world = replace(world, scenes=config.scenes, steps=config.steps, seed=config.seed, engine=config.engine, **asked)
