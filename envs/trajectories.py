@@ -114,6 +114,15 @@ def edge_types(kind: Int[np.ndarray, "S V"], present: Bool[np.ndarray, "S V"]) -
     return edges
 
 
+def chasing(edges: Int[np.ndarray, "S V V"], target: Int[np.ndarray, "S N M"]) -> Int[np.ndarray, "S V V"]:
+    """The graph of chasers: of the edges between agents only those from an agent's targets stay (-1: no target)."""
+    agents = target.shape[1]
+    chased = (target[..., None] == np.arange(agents)).any(axis=2)  # (scene, chaser, target)
+    kept = edges.copy()
+    kept[:, -agents:, -agents:] *= chased.transpose(0, 2, 1)
+    return kept
+
+
 def from_recording(recording: Recording, spec: SceneSpec, provenance: dict) -> Trajectories:
     """Trajectories of a rollout: nodes goal, obstacles, agents; absent nodes masked and zero."""
     start = recording.start
@@ -148,6 +157,9 @@ def from_recording(recording: Recording, spec: SceneSpec, provenance: dict) -> T
         full[:, 1:, nodes:] = np.asarray(values)
         return full
 
+    edges = edge_types(kind, present)
+    if start.target.shape[-1]:
+        edges = chasing(edges, np.asarray(start.target))
     radius = np.select([kind == AGENT, kind == OBSTACLE], [spec.agent_radius, spec.obstacle_radius], 0.0)
     return Trajectories(
         position=nodes_of(position, obstacle),
@@ -155,7 +167,7 @@ def from_recording(recording: Recording, spec: SceneSpec, provenance: dict) -> T
         mask=mask,
         kind=kind,
         radius=np.where(present, radius, 0).astype(np.float32),
-        edges=edge_types(kind, present),
+        edges=edges,
         agent_contact=per_row(contacts.agent_states),
         solid_contact=per_row(np.asarray(contacts.obstacle_states) + np.asarray(contacts.wall_states)),
         agent_events=per_row(contacts.agent_events),

@@ -10,7 +10,15 @@ from swarm_mjcf.spec import SceneSpec
 
 
 def scene_state(
-    spec: SceneSpec, position, velocity=None, *, goal=None, obstacle=None, agent_present=None, obstacle_present=None
+    spec: SceneSpec,
+    position,
+    velocity=None,
+    *,
+    goal=None,
+    obstacle=None,
+    agent_present=None,
+    obstacle_present=None,
+    target=None,
 ) -> State:
     """A float32 state from anything array-like; what is not given is zero, present, or (obstacles) absent."""
     position = np.asarray(position, np.float32)
@@ -25,6 +33,7 @@ def scene_state(
         obstacle=np.asarray(obstacle, np.float32),
         agent_present=None if agent_present is None else np.asarray(agent_present, bool),
         obstacle_present=None if obstacle_present is None else np.asarray(obstacle_present, bool),
+        target=target,
     )
     return jax.device_get(park(state, spec))
 

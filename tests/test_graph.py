@@ -66,8 +66,9 @@ def test_ghosts_neither_send_nor_receive(seed: int):
                     assert bool(mask[scene, i, j]) == expected
 
 
+@pytest.mark.parametrize("chasing", [False, True])
 @pytest.mark.parametrize("goal", [True, False])
-def test_a_state_and_its_recording_give_the_same_nodes_and_graph(goal: bool):
+def test_a_state_and_its_recording_give_the_same_nodes_and_graph(goal: bool, chasing: bool):
     spec = SceneSpec(num_agents=4, num_obstacles=2, goal=goal, substeps=1, contacts=False)
     rng = np.random.default_rng(0)
     start = scene_state(
@@ -78,6 +79,7 @@ def test_a_state_and_its_recording_give_the_same_nodes_and_graph(goal: bool):
         obstacle=rng.uniform(-50, 50, (12, 2, 2)),
         agent_present=rng.random((12, 4)) < 0.6,
         obstacle_present=rng.random((12, 2)) < 0.6,
+        target=rng.integers(-1, 4, (12, 4, 2)).astype(np.int32) if chasing else None,
     )
     twice = lambda x: np.stack([x, x], axis=1)  # noqa: E731
     still = jax.tree.map(lambda x: np.asarray(x)[:, None], no_contacts(12, 4))
@@ -91,6 +93,16 @@ def test_a_state_and_its_recording_give_the_same_nodes_and_graph(goal: bool):
     assert_same(jax.device_get(graph), jax.device_get(recorded))
     np.testing.assert_array_equal(nodes, history[:, 0])
     assert graph.counts == (int(goal), 2, 4)
+
+
+def test_a_chaser_receives_from_its_targets_alone():
+    spec = SceneSpec(num_agents=4, num_obstacles=0, goal=False, substeps=1, contacts=False)
+    target = np.array([[[1, -1], [0, 3], [3, -1], [-1, -1]]], np.int32)
+    place = np.zeros((1, 4, 2))
+    _, graph = graph_of_state(scene_state(spec, place, place, target=target), goal=False)
+    expected = np.zeros((4, 4), bool)
+    expected[[0, 1, 1, 2], [1, 0, 3, 3]] = True  # (receiver, sender)
+    np.testing.assert_array_equal(np.asarray(graph.agent)[0], expected)
 
 
 def test_windows_are_the_rows_after_their_start():

@@ -248,6 +248,43 @@ def test_x_in_cm_beside_y_in_m_is_converted_as_the_header_says(tmp_path: Path):
     assert track.facts["z"] == "left out, varies by at most 0 m within an id"
 
 
+def test_a_csv_with_x_in_cm_beside_y_in_m(tmp_path: Path):
+    mixed = text("a.csv", "t [ms],id,x [cm],y (m)\n0,1,100,3\n200,1,120,3.5\n")(tmp_path)
+    (track,) = read(mixed, PLAIN)
+    np.testing.assert_allclose(track.position, [[1, 3], [1.2, 3.5]])
+    np.testing.assert_allclose(track.time, [0, 0.2])
+    assert (track.facts["unit of x"], track.facts["unit of y"]) == ("cm (header)", "m (header)")
+    with pytest.raises(ImportFailed, match="its header says cm, --unit says m"):
+        read(mixed, ImportConfig(unit="m"))
+
+
+def test_a_frame_rate_counts_frames_alone(tmp_path: Path):
+    path = text("a.csv", "t,id,x,y\n0,1,1,3\n5,1,1.2,3\n")(tmp_path)
+    (track,) = read(path, ImportConfig(unit="m", time_unit="frame", fps=25.0))
+    np.testing.assert_allclose(track.time, [0, 0.2])
+
+
+@pytest.mark.parametrize("format", ["csv", "juelich", "eth"])
+def test_a_third_coordinate_that_varies_is_said_and_one_that_is_no_number_refused(format: str, tmp_path: Path):
+    def written(heights: tuple[str, ...]) -> tuple[Path, ImportConfig]:
+        rows = enumerate(heights)
+        if format == "csv":
+            return text("a.csv", "t,id,x,y,z\n" + "\n".join(f"{k},1,{k},0,{z}" for k, z in rows))(tmp_path), METRES
+        if format == "juelich":
+            head = "# framerate: 5 fps\n# id frame x/m y/m z/m\n"
+            return text("a.txt", head + "\n".join(f"1 {k} {k} 0 {z}" for k, z in rows))(tmp_path), PLAIN
+        lines = "\n".join(f"{k} 1 {k} {z} 0 1 0 0" for k, z in rows)
+        return text("obsmat.txt", lines)(tmp_path), ImportConfig(fps=5.0)
+
+    (track,) = read(*written(("1.7", "1.75", "1.72")))
+    assert track.facts["z"] == "left out, varies by at most 0.05 m within an id"
+    (track,) = read(*written(("1.7", "2.5", "3.4")))
+    assert "left out although it varies by up to 1.7 m" in track.facts["z"]
+    assert track.position.shape == (3, 2)
+    with pytest.raises(ImportFailed, match="z is not finite"):
+        read(*written(("1.7", "nan", "3.4")))
+
+
 def test_two_files_of_different_declared_units(tmp_path: Path):
     first = juelich(tmp_path / "a.txt", header="# framerate: 5\n# id frame x/cm y/m\n")
     second = jupedsim(tmp_path / "b.sqlite")
@@ -330,6 +367,11 @@ BROKEN = {
     "csv no unit": (text("a.csv", "t,id,x,y\n0,1,2,3\n"), ImportConfig(time_unit="s"), "give --unit, one of m"),
     "csv no time unit": (text("a.csv", "t,id,x,y\n0,1,2,3\n"), ImportConfig(unit="m"), "give --time-unit"),
     "csv frames without rate": (text("a.csv", "frame,id,x,y\n0,1,2,3\n"), ImportConfig(unit="m"), "give --fps"),
+    "csv rate beside times": (
+        text("a.csv", "t,id,x,y\n0,1,2,3\n"),
+        replace(METRES, fps=25.0),
+        "--fps says 25 frames per second, and column 't' holds times; leave --fps out",
+    ),
     "csv unit said twice": (text("a.csv", "t,id,x/cm,y/cm\n0,1,2,3\n"), METRES, "says cm, --unit says m"),
     "csv unknown unit": (text("a.csv", "t,id,x/ell,y/m\n0,1,2,3\n"), METRES, "'ell', known are m, dm"),
     "csv word": (text("a.csv", "t,id,x,y\n0,1,2,3\n1,1,two,3\n"), METRES, "column x: .*two"),
@@ -778,6 +820,9 @@ def test_import_writes_a_card_and_keeps_what_is_there(tmp_path: Path, capsys, mo
     assert main(arguments) == 0
     assert "was there already" in capsys.readouterr().out
     assert out.read_bytes() == written
+    card_path(out).unlink()
+    assert main(arguments) == 0
+    assert card_path(out).read_text() == card, "a card that was deleted is written again"
     assert main((*arguments, "--radius", "0.2")) == 2
     assert "exists and holds something else" in capsys.readouterr().err
 
@@ -841,7 +886,7 @@ def test_an_imported_recording_can_be_trained_on(tmp_path: Path, monkeypatch, ca
 
 def test_the_page_about_data_tells_commands_that_parse_and_code_that_runs(tmp_path: Path, monkeypatch, capsys):
     page = (Path(__file__).parent.parent / "docs" / "data.md").read_text()
-    commands = re.findall(r"(?:`|^    )swarmnet ((?:import|export|train) [^`\n]+)", page, re.MULTILINE)
+    commands = re.findall(r"(?:`|^    )swarmnet ((?:import|export|train|evaluate|learn) [^`\n]+)", page, re.MULTILINE)
     assert len(commands) >= 15
     for command in commands:
         parse(shlex.split(command))

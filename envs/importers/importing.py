@@ -56,7 +56,8 @@ def import_files(
 ) -> Imported:
     """Writes `out`, its card, and its hold-out beside it where one is asked for; each whole or not at all.
 
-    Files that hold exactly this already are kept.
+    Files that hold exactly this already are kept; a card that was deleted is written again, with lists as long as the
+    file's own copy has them.
 
     Args:
       files: recordings; each is one run, or several where it says so.
@@ -74,6 +75,9 @@ def import_files(
     mark = fingerprint(sources, config)
     have = [_existing(path, mark) for path in outs]
     if all(have):
+        for path, header in zip(outs, have, strict=True):
+            if header is not None and not card_path(path).exists():
+                _write_text(card_path(path), card.render(header.provenance["import"], path.name))
         return Imported(have[0], have[1] if config.holdout else None, existed=True)  # pyright: ignore[reportArgumentType]
     tracks, facts = [], []
     for path in files:

@@ -69,6 +69,11 @@ def runs_of(
         raise ImportFailed(f"{path}: no rows of data")
     units = {ours: column.unit for ours, column in columns.items()}
     clock = "t" if "t" in columns else "frame"
+    if clock == "t" and config.fps is not None and "frame" not in (units["t"], config.time_unit):
+        raise ImportFailed(
+            f"{path}: --fps says {config.fps:g} frames per second, and column {columns['t'].name!r} holds times; leave "
+            "--fps out, or say that it counts frames: --time-unit frame"
+        )
     to_seconds, time_fact = seconds(path, config, "frame" if clock == "frame" else units["t"])
     scale, said = {}, {}
     for axis in ("x", "y", *(("z",) if "z" in columns else ())):

@@ -185,13 +185,13 @@ def _scale(
 
 def height_fact(name: str, height: Float[np.ndarray, " n"], id: np.ndarray) -> str:
     """What is said of a third coordinate [m], which is left out: people's height, or motion that is no longer flat."""
+    if not np.isfinite(height).all():
+        raise ImportFailed(f"{name}: z is not finite in some rows; leave the column out (it is not used)")
     _, code = numbered(id)
     low, high = np.full(code.max() + 1, np.inf), np.full(code.max() + 1, -np.inf)
     np.minimum.at(low, code, height)
     np.maximum.at(high, code, height)
     most = float((high - low).max())
-    if not np.isfinite(most):
-        raise ImportFailed(f"{name}: z is not finite in some rows; leave the column out (it is not used)")
     if most > HEIGHT:
         return f"left out although it varies by up to {most:.3g} m within one id: only the motion in the plane is kept"
     return f"left out, varies by at most {most:.3g} m within an id"
