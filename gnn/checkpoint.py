@@ -12,9 +12,11 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from envs.plain import from_plain, plain
-from gnn.config import ModelConfig
-from gnn.decode import Integrator, Params
+from gnn.config import AnyModelConfig, config_kinds
+from gnn.decode import Integrator
+from gnn.family import Params, Predict
 from gnn.features import Scales
+from gnn.registry import make_family
 from swarm_mjcf.errors import SwarmError
 
 _LOG = logging.getLogger(__name__)
@@ -29,12 +31,17 @@ class CheckpointError(SwarmError):
 class Model:
     """A trained model: weights and all that decoding needs."""
 
-    config: ModelConfig
+    config: AnyModelConfig
     scales: Scales
     integrator: Integrator
     params: Params
     about: dict
     """Plain JSON: preset, step, training settings and data it was made with."""
+
+    @property
+    def predict(self) -> Predict:
+        """`predict(params, history (B, W, V, 4), graph, horizon=h) -> (B, h, V, 4)`."""
+        return make_family(self.config, self.scales, self.integrator).predict
 
 
 class Checkpoints:
@@ -109,9 +116,10 @@ class Checkpoints:
         self._manager.close()
 
 
-def describe(config: ModelConfig, scales: Scales, integrator: Integrator) -> dict:
+def describe(config: AnyModelConfig, scales: Scales, integrator: Integrator) -> dict:
     """What `load_model` needs besides the weights, as plain JSON (floats survive exactly)."""
     return {
+        "family": type(config).__name__,
         "model": plain(config),
         "scales": {name: np.asarray(value, np.float64).tolist() for name, value in vars(scales).items()},
         "integrator": plain(integrator),
@@ -130,7 +138,8 @@ def load_model(folder: str | Path) -> Model:
         raise CheckpointError(f"{folder}: holds no whole checkpoint")
     step, about, state = found
     with _explained(folder, "read"):
-        config = from_plain(ModelConfig, about["model"])
+        kind = config_kinds()[about.get("family", "ModelConfig")]  # older checkpoints knew one family
+        config = from_plain(kind, about["model"])
         scales = Scales(**{name: jnp.asarray(value, jnp.float32) for name, value in about["scales"].items()})
         integrator = from_plain(Integrator, about["integrator"])
     return Model(config, scales, integrator, state["params"], about | {"step": step})

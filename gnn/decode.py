@@ -11,15 +11,12 @@ from envs.dynamics import free_flight, limited
 from envs.policy import Policy
 from envs.record import Array
 from envs.state import State
-from gnn.config import ModelConfig
+from gnn.config import AnyModelConfig, ModelConfig
+from gnn.family import Init, Params, Predict
 from gnn.features import Scales
 from gnn.graph import Graph, graph_of_state
 from gnn.swarmnet import SwarmNet
 from swarm_mjcf.errors import SwarmError
-
-Params = dict
-"""Nested dict of weights, see `gnn.swarmnet`."""
-Predict = Callable[..., Array]
 
 
 @dataclass(frozen=True)
@@ -36,22 +33,37 @@ class Integrator:
     """[m/s^2]"""
 
 
-def network(config: ModelConfig, scales: Scales) -> Callable[[Params, Array, Graph], Array]:
-    """`(params, history (B, W, V, 4), graph) -> (B, n, out)`, the network's raw output."""
+def network(config: ModelConfig, scales: Scales) -> Callable[..., Array]:
+    """`(params, history (B, W, V, 4), graph, key=None) -> (B, n, out)`, the network's raw output.
+
+    With a key, neurons are dropped at random (`config.dropout`); without one none is.
+    """
     model = SwarmNet(config, scales)
 
-    def apply(params: Params, history: Array, graph: Graph) -> Array:
-        return jnp.asarray(model.apply({"params": params}, history, graph))
+    def apply(params: Params, history: Array, graph: Graph, key: jax.Array | None = None) -> Array:
+        rngs = None if key is None else {"dropout": key}
+        return jnp.asarray(model.apply({"params": params}, history, graph, rngs=rngs))
 
     return apply
+
+
+def network_init(config: ModelConfig, scales: Scales) -> Init:
+    """Initial weights of the network."""
+
+    def init(key: jax.Array, history: Array, graph: Graph) -> Params:
+        return dict(SwarmNet(config, scales).init(key, history, graph)["params"])
+
+    return init
 
 
 def make_predict(config: ModelConfig, scales: Scales, integrator: Integrator) -> Predict:
     """`predict(params, history (B, W, V, 4), graph, horizon=h) -> (B, h, V, 4)`, each state fed back as input."""
     apply = network(config, scales)
 
-    def advance(params: Params, history: Float[Array, "B W V 4"], graph: Graph) -> Float[Array, "B V 4"]:
-        out = apply(params, history, graph)
+    def advance(
+        params: Params, history: Float[Array, "B W V 4"], graph: Graph, key: jax.Array | None
+    ) -> Float[Array, "B V 4"]:
+        out = apply(params, history, graph, key)
         last = history[:, -1]
         if config.output == "state_change":
             return last + out
@@ -65,23 +77,27 @@ def make_predict(config: ModelConfig, scales: Scales, integrator: Integrator) ->
         context = jnp.asarray(last[:, :first]).at[..., :2].add(last[:, :first, 2:] * integrator.dt)
         return jnp.concatenate([context, jnp.where(here, after, last[:, first:])], axis=1)
 
-    def predict(params: Params, history: Array, graph: Graph, *, horizon: int) -> Float[Array, "B h V 4"]:
-        def step(history: Array, _: None):
-            after = advance(params, history, graph)
+    def predict(
+        params: Params, history: Array, graph: Graph, *, horizon: int, key: jax.Array | None = None
+    ) -> Float[Array, "B h V 4"]:
+        keys = jax.random.split(key, horizon) if key is not None and config.dropout else None
+
+        def step(history: Array, key: jax.Array | None):
+            after = advance(params, history, graph, key)
             return jnp.concatenate([history[:, 1:], after[:, None]], axis=1), after
 
-        _, states = jax.lax.scan(step, history, None, length=horizon)
+        _, states = jax.lax.scan(step, history, keys, length=horizon)
         return jnp.swapaxes(states, 0, 1)
 
     return predict
 
 
-def make_policy(config: ModelConfig, scales: Scales, *, goal: bool = True) -> Policy:
+def make_policy(config: AnyModelConfig, scales: Scales, *, goal: bool = True) -> Policy:
     """The network as a policy `(state, params, key) -> acceleration (S, N, 2) [m/s^2]` for the environment.
 
     Raises SwarmError for a model that sees a history or predicts state changes: it has no acceleration to execute.
     """
-    if config.window != 1 or config.output != "acceleration":
+    if not (isinstance(config, ModelConfig) and config.acts):
         raise SwarmError(
             "a model with a history window or a state-change output (preset thesis-ch3) predicts, it does not act: "
             "physics needs an acceleration from the present state; use preset thesis-ch5 or best"

@@ -1,4 +1,4 @@
-"""Prediction error by horizon in the thesis's normalisation, beside the two baselines that need no learning."""
+"""Prediction error by horizon, in the thesis's normalisation and in metres, beside two baselines that learn nothing."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from envs.record import Array
 from envs.trajectories import AGENT, Trajectories
-from gnn.decode import Params, Predict
+from gnn.family import Params, Predict
 from gnn.graph import Graph
 from gnn.windows import Dataset, check_rows, windows
 
@@ -25,6 +25,10 @@ class PredictionError:
     `published` = MSE over all predicted steps up to the horizon, all present nodes and all 4 dimensions, divided by the
     mean squared one-step change of the same nodes over the whole data (eq. 3.4 without its factor 1/2, as coded).
     `agents` = the same over agent nodes alone. Mean and median over all windows of all trajectories.
+
+    `ade` and `fde` are what is usual for pedestrians: distance between predicted and true position, mean over the steps
+    up to the horizon and at the horizon, mean over all paths: agents of a window that are there at every one of these
+    steps.
     """
 
     horizons: tuple[int, ...]
@@ -36,9 +40,17 @@ class PredictionError:
     """`agents` error of each single step 1..H, mean over windows."""
     windows: tuple[int, ...]
     """Number of windows at each horizon."""
+    ade: tuple[float, ...]
+    """Average displacement error [m]; NaN where no agent stays that long."""
+    fde: tuple[float, ...]
+    """Final displacement error [m]."""
+    paths: tuple[int, ...]
+    """Number of paths at each horizon."""
+    displacement: Float[np.ndarray, " H"]
+    """Final displacement error [m] of each step 1..H."""
 
 
-def persistence(params: Params, history: Array, graph: Graph, *, horizon: int) -> Array:
+def persistence(params: Params, history: Array, graph: Graph, *, horizon: int, key: jax.Array | None = None) -> Array:
     """Nothing changes."""
     return jnp.broadcast_to(history[:, -1:], (history.shape[0], horizon, *history.shape[2:]))
 
@@ -46,7 +58,7 @@ def persistence(params: Params, history: Array, graph: Graph, *, horizon: int) -
 def constant_velocity(dt: float) -> Predict:
     """Everybody keeps its velocity."""
 
-    def predict(params: Params, history: Array, graph: Graph, *, horizon: int) -> Array:
+    def predict(params: Params, history: Array, graph: Graph, *, horizon: int, key: jax.Array | None = None) -> Array:
         last = history[:, -1:]
         ahead = dt * jnp.arange(1, horizon + 1)[None, :, None, None]
         return jnp.concatenate([last[..., :2] + ahead * last[..., 2:], last[..., 2:].repeat(horizon, 1)], axis=-1)
@@ -78,7 +90,7 @@ def prediction_error(
     padded = longest + starts - 1 + window - rows
     run = jax.jit(partial(_batch_errors, predict, window=window, horizon=longest, counts=counts, starts=starts))
     first_agent = counts[0] + counts[1]
-    sums = []
+    sums, moved = [], np.zeros((3, longest))
     for first in range(0, len(trajectories), scenes_per_batch):
         chosen = np.arange(first, first + scenes_per_batch).clip(max=len(trajectories) - 1)
         batch = jax.tree.map(lambda x, chosen=chosen: x[chosen], data)
@@ -87,9 +99,10 @@ def prediction_error(
             mask=jnp.pad(batch.mask, ((0, 0), (0, padded), (0, 0))),
             edges=batch.edges,
         )
-        square, count = (np.asarray(x, np.float64) for x in run(params, batch))
+        square, count, displaced = (np.asarray(x, np.float64) for x in run(params, batch))
         real = min(scenes_per_batch, len(trajectories) - first)
         sums.append((square[: real * starts], count[: real * starts]))
+        moved += displaced[: real * starts].sum(axis=0)
         if progress:
             progress(first + real, len(trajectories))
     square, count = (np.concatenate(part) for part in zip(*sums, strict=True))  # (windows, longest, V)
@@ -107,8 +120,17 @@ def prediction_error(
             results[key + "d"].append(float(np.median(errors)) if len(errors) else float("nan"))
     total = count[:, :, first_agent:].sum(axis=(0, 2))
     steps = square[:, :, first_agent:].sum(axis=(0, 2)) / np.maximum(4 * total, 1) / norm_agents
+    average, final = np.divide(moved[:2], moved[2], out=np.full((2, longest), np.nan), where=moved[2] > 0)
+    at = np.asarray(horizons) - 1
     return PredictionError(
-        horizons, *(tuple(results[key]) for key in ("pm", "pd", "am", "ad")), by_step=steps, windows=tuple(used)
+        horizons,
+        *(tuple(results[key]) for key in ("pm", "pd", "am", "ad")),
+        by_step=steps,
+        windows=tuple(used),
+        ade=tuple(average[at].tolist()),
+        fde=tuple(final[at].tolist()),
+        paths=tuple(moved[2][at].astype(int).tolist()),
+        displacement=final,
     )
 
 
@@ -136,18 +158,24 @@ def _batch_errors(
     horizon: int,
     counts: tuple[int, int, int],
     starts: int,
-) -> tuple[Array, Array]:
-    """Squared errors summed over 4 dimensions (windows, horizon, V) and where they count; one start at a time."""
+) -> tuple[Array, Array, Array]:
+    """Of every window, one start at a time: squared errors summed over 4 dimensions (windows, horizon, V), where they
+    count, and for each step (windows, 3, horizon) sums over the agents there up to it: mean displacement so far [m],
+    displacement at it [m], and their number."""
     scenes = data.states.shape[0]
+    number = jnp.arange(1, horizon + 1)[:, None]
 
     def one_start(_: None, start: Array):
         history, truth, mask, graph = windows(
             data, jnp.arange(scenes), jnp.full(scenes, start), window=window, horizon=horizon, counts=counts
         )
         predicted = predict(params, history, graph, horizon=horizon)
-        square = jnp.sum((predicted - truth) ** 2, axis=-1)
-        return None, (jnp.where(mask, square, 0), mask)
+        wrong = (predicted - truth) ** 2
+        stays = jnp.cumprod(mask[:, :, sum(counts[:2]) :], axis=1)
+        apart = jnp.sqrt(jnp.sum(wrong[:, :, sum(counts[:2]) :, :2], axis=-1))
+        sofar = jnp.cumsum(jnp.where(stays, apart, 0), axis=1) / number
+        displaced = jnp.stack([jnp.where(stays, x, 0).sum(axis=-1) for x in (sofar, apart, 1.0)], axis=1)
+        return None, (jnp.where(mask, wrong.sum(axis=-1), 0), mask, displaced)
 
-    _, (square, mask) = jax.lax.scan(one_start, None, jnp.arange(starts))
-    shape = (scenes * starts, horizon, data.states.shape[2])
-    return jnp.swapaxes(square, 0, 1).reshape(shape), jnp.swapaxes(mask, 0, 1).reshape(shape)
+    _, found = jax.lax.scan(one_start, None, jnp.arange(starts))
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(scenes * starts, *x.shape[2:]), found)

@@ -43,7 +43,10 @@ def graph_of_edges(edges: Int[Array, "B V V"], present: Bool[Array, "B V"], coun
 
 
 def graph_of_state(state: State, *, goal: bool) -> tuple[Float[Array, "S V 4"], Graph]:
-    """Node states and graph of an environment's state: every agent receives from everything present but itself."""
+    """Node states and graph of an environment's state: every agent receives from everything present but itself.
+
+    Of other agents, a chaser receives from its targets alone.
+    """
     scenes, agents, _ = state.position.shape
     here = state.agent_present
     goals = jnp.ones((scenes, int(goal)), bool)
@@ -54,6 +57,8 @@ def graph_of_state(state: State, *, goal: bool) -> tuple[Float[Array, "S V 4"], 
         parts.insert(0, jnp.concatenate([state.goal, jnp.zeros_like(state.goal)], axis=-1)[:, None])
     nodes = jnp.concatenate(parts, axis=1)
     others = ~np.eye(agents, dtype=bool)
+    if state.target.shape[2]:
+        others = others & (state.target[..., None] == jnp.arange(agents)).any(axis=2)
     graph = Graph(
         present=jnp.concatenate([goals, state.obstacle_present, here], axis=1),
         goal=here[:, :, None] & goals[:, None],

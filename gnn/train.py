@@ -4,8 +4,10 @@ Everything random at gradient step n is drawn from (seed, n), and training stops
 the global step, so weights, optimizer and n are the full state: a continued run does what an uninterrupted one would.
 """
 
+import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -19,20 +21,22 @@ from envs.plain import plain
 from envs.record import Array
 from envs.trajectories import Trajectories
 from gnn.checkpoint import CheckpointError, Checkpoints, Model, describe
-from gnn.config import TrainConfig, model_preset
-from gnn.decode import Integrator, Predict, make_predict
+from gnn.config import AnyModelConfig, TrainConfig, model_preset
+from gnn.decode import Integrator
 from gnn.evaluate import natural_change
+from gnn.family import Family, Params, Predict
 from gnn.features import Scales
-from gnn.graph import Graph
-from gnn.losses import multi_step_loss
+from gnn.freeze import Mask, free_leaves, frozen, paths_of
+from gnn.freeze import freeze as freezing
 from gnn.metrics import Metrics
-from gnn.swarmnet import SwarmNet
+from gnn.ranges import figures_of
+from gnn.registry import make_family
 from gnn.windows import Dataset, check_rows, windows
-from swarm_mjcf.errors import SwarmError
+from swarm_mjcf.errors import SpecError, SwarmError
 
 Progress = Callable[[int, int, dict], None]
 """Called with (steps done, steps in all, metrics of the chunk)."""
-VALIDATION_WINDOWS = 256
+VALIDATION_WINDOWS = 64
 
 
 class TrainError(SwarmError):
@@ -46,38 +50,108 @@ def train(
     *,
     validation: Trajectories | None = None,
     progress: Progress | None = None,
+    initial: Model | None = None,
+    freeze: Sequence[str] = (),
 ) -> Model:
     """Trains in `folder` (checkpoints/, metrics.jsonl, tensorboard/) or goes on from its newest checkpoint.
 
-    Raises TrajectoryError for trajectories too short, CheckpointError for a folder of other settings or data,
-    TrainError when the loss diverges.
+    `initial`: a model whose weights and scales are taken over (tuning); Adam starts afresh. `freeze`: patterns over the
+    paths of the weights (`edge/*`); what they match stays as it is (`gnn.freeze`).
+
+    Raises TrajectoryError for trajectories too short, SpecError for an initial model of another kind and for patterns
+    that match nothing, CheckpointError for a folder of other settings or data, TrainError when the loss diverges.
     """
-    folder, preset = Path(folder), model_preset(config.model)
-    check_rows(trajectories, preset.window + max(config.horizons), f"a horizon of {max(config.horizons)} steps")
+    prepared = prepare(config, trajectories, validation=validation, initial=initial, freeze=freeze)
+    return train_prepared(prepared, folder, progress=progress)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that one training consists of but its folder. Nothing compiled depends on the number of steps."""
+
+    config: TrainConfig
+    preset: AnyModelConfig
+    scales: Scales
+    integrator: Integrator
+    origin: dict
+    """Where data and initial weights come from, and what is frozen: plain JSON."""
+    data: Dataset
+    start: Callable[[], dict]
+    """The state before the first step: weights, optimizer, step."""
+    run_chunk: Callable[..., tuple[dict, Array, Array]]
+    """`(state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`; one compile per horizon."""
+    measure: Callable[[Params], Array]
+    """The validation error of weights."""
+
+    @property
+    def about(self) -> dict:
+        """What is stored with the weights."""
+        return {
+            "preset": self.config.model,
+            "train": plain(self.config) | {"checkpoint_seconds": None},  # how often to save changes nothing else
+            **self.origin,
+            **describe(self.preset, self.scales, self.integrator),
+        }
+
+
+def prepare(
+    config: TrainConfig,
+    trajectories: Trajectories,
+    *,
+    validation: Trajectories | None = None,
+    initial: Model | None = None,
+    freeze: Sequence[str] = (),
+) -> Prepared:
+    """Checks everything and makes the functions of a training; compiles nothing yet. Arguments as in `train`."""
+    preset, furthest = model_preset(config.model), max(config.horizons)
+    check_rows(trajectories, preset.window + furthest, f"a horizon of {furthest} steps")
     if validation is not None:
-        check_rows(validation, preset.window + max(config.horizons), f"a validation of {max(config.horizons)} steps")
-    scales = Scales.of(trajectories) if preset.normalise else _loss_scales(trajectories)
+        check_rows(validation, preset.window + furthest, f"a validation of {furthest} steps")
+    if initial is not None and initial.config != preset:
+        raise SpecError("model", config.model, f"the initial model's preset, {initial.about.get('preset')}")
+    scales = Scales.of(trajectories) if initial is None else initial.scales
     integrator = Integrator(
         trajectories.dt, trajectories.substeps, trajectories.max_speed, trajectories.max_acceleration
     )
-    about = {
-        "preset": config.model,
-        "train": plain(config) | {"checkpoint_seconds": None},  # how often to save changes nothing else
-        "data": {"scenes": len(trajectories), **trajectories.provenance},
-        **describe(preset, scales, integrator),
-    }
-    predict = make_predict(preset, scales, integrator)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.clip_norm),
-        optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps)),
-    )
+    family = make_family(preset, scales, integrator)
     data, counts = Dataset.of(trajectories), trajectories.counts
-    start = partial(_initial, config, data, counts, scales, optimizer)
+    first = partial(_first_weights, config, family, data, counts)
+    shapes = jax.eval_shape(first)
+    if initial is not None:
+        _check_weights(initial.params, shapes)
+    mask = frozen(shapes, freeze)
+    optimizer = freezing(optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.scale_by_adam()), mask)
 
+    def start() -> dict:
+        params = first() if initial is None else jax.tree.map(jnp.asarray, initial.params)
+        state = {"params": params, "optimizer": optimizer.init(params), "step": jnp.zeros((), jnp.int32)}
+        return state | ({"raw": params} if config.average else {})
+
+    return Prepared(
+        config=config,
+        preset=preset,
+        scales=scales,
+        integrator=integrator,
+        origin={
+            "data": {"scenes": len(trajectories), **trajectories.provenance},
+            "range": figures_of(trajectories),
+            "initial": None if initial is None else {"weights": fingerprint(initial.params), **initial.about},
+            "freeze": list(freeze) or None,
+        },
+        data=data,
+        start=start,
+        run_chunk=_make_chunk(config, family, scales, optimizer, mask, counts),
+        measure=_make_validation(family.predict, validation or trajectories, preset.window, furthest),
+    )
+
+
+def train_prepared(prepared: Prepared, folder: str | Path, *, progress: Progress | None = None) -> Model:
+    """`train` for what was prepared before."""
+    folder, config, about = Path(folder), prepared.config, prepared.about
     checkpoints = Checkpoints(folder / "checkpoints")
     found = checkpoints.newest()
     if found is None:
-        state = start()
+        state = prepared.start()
     else:
         step, had, _ = found
         different = [key for key in about if had.get(key) != about[key]]
@@ -86,18 +160,17 @@ def train(
                 f"{folder}: holds a run with other settings ({', '.join(different)} differ); take another run name"
             )
         checkpoints.drop_after(step)
-        state = checkpoints.restore(step, jax.eval_shape(start))
+        state = checkpoints.restore(step, jax.eval_shape(prepared.start))
     done = int(state["step"])
-    run_chunk = _make_chunk(config, predict, scales, optimizer, counts)
-    measure = _make_validation(predict, validation or trajectories, preset.window, max(config.horizons))
     metrics = Metrics(folder, after_step=done)
     saved_at, saved_step = time.monotonic(), done
     stage_ends = np.cumsum(config.stage_steps)
     try:
         while done < config.steps:
             stage = int(np.searchsorted(stage_ends, done, side="right"))
+            horizon = config.horizons[stage]
             started = time.monotonic()
-            new, loss, norm = run_chunk(state, data, horizon=config.horizons[stage])
+            new, loss, norm = prepared.run_chunk(state, prepared.data, config.steps, horizon=horizon)
             loss = float(loss)
             if not np.isfinite(loss):
                 raise TrainError(
@@ -105,8 +178,8 @@ def train(
                     f"a smaller learning_rate than {config.learning_rate}"
                 )
             state, done = new, done + config.chunk
-            row = {"stage": stage, "horizon": config.horizons[stage], "loss": loss, "gradient_norm": float(norm)}
-            row["validation_error"] = float(measure(state["params"]))
+            row = {"stage": stage, "horizon": horizon, "loss": loss, "gradient_norm": float(norm)}
+            row["validation_error"] = float(prepared.measure(state["params"]))
             row["steps_per_second"] = config.chunk / (time.monotonic() - started)
             metrics.write(done, **row)
             due = time.monotonic() - saved_at + 2 * (time.monotonic() - started) > config.checkpoint_seconds
@@ -118,37 +191,58 @@ def train(
     finally:
         metrics.close()
         checkpoints.close()
-    return Model(preset, scales, integrator, jax.device_get(state["params"]), about | {"step": done})
+    params = jax.device_get(state["params"])
+    return Model(prepared.preset, prepared.scales, prepared.integrator, params, about | {"step": done})
 
 
-def _loss_scales(trajectories: Trajectories) -> Scales:
-    """No scaling of inputs, but the loss still has the data's units."""
-    measured, ones = Scales.of(trajectories), vars(Scales.ones())
-    return Scales(**ones | {"position_change": measured.position_change, "velocity_change": measured.velocity_change})
+def split(trajectories: Trajectories, share: float) -> tuple[Trajectories, Trajectories]:
+    """Scenes to train on and scenes for the validation: the first of them, `share` of all and at least one.
+
+    Raises SpecError for a share that leaves nothing to train on.
+    """
+    if not 0 < share < 1:
+        raise SpecError("validation", share, "a share between 0 and 1")
+    kept = max(1, round(share * len(trajectories)))
+    if kept >= len(trajectories):
+        raise SpecError("validation", share, f"a share that leaves some of {len(trajectories)} scenes to train on")
+    return trajectories.take(slice(kept, None)), trajectories.take(slice(0, kept))
 
 
-def _initial(config: TrainConfig, data: Dataset, counts: tuple, scales: Scales, optimizer) -> dict:
-    preset = model_preset(config.model)
+def fingerprint(params: Params) -> str:
+    """Short hash of weights."""
+    found = hashlib.sha256()
+    for path, leaf in zip(paths_of(params), jax.tree.leaves(params), strict=True):
+        found.update(path.encode() + np.asarray(leaf).tobytes())
+    return found.hexdigest()[:16]
+
+
+def _check_weights(params: Params, shapes: Params) -> None:
+    """Raises SpecError unless the weights fit a network for this data."""
+    have = {path: np.shape(leaf) for path, leaf in zip(paths_of(params), jax.tree.leaves(params), strict=True)}
+    need = {path: leaf.shape for path, leaf in zip(paths_of(shapes), jax.tree.leaves(shapes), strict=True)}
+    different = sorted(path for path in have.keys() | need.keys() if have.get(path) != need.get(path))
+    if different:
+        raise SpecError("initial", ", ".join(different), "weights for the same kinds of nodes as in the data")
+
+
+def _first_weights(config: TrainConfig, family: Family, data: Dataset, counts: tuple[int, int, int]) -> Params:
     zero = jnp.zeros(1, jnp.int32)
-    history, _, _, graph = windows(data, zero, zero, window=preset.window, horizon=1, counts=counts)
-
-    @jax.jit  # otherwise every layer's draw compiles for itself
-    def initial(key: Key[jax.Array, ""], history: Array, graph: Graph) -> dict:
-        params = SwarmNet(preset, scales).init(key, history, graph)["params"]
-        return {"params": params, "optimizer": optimizer.init(params), "step": jnp.zeros((), jnp.int32)}
-
-    return initial(jax.random.key(config.seed), history, graph)
+    history, _, _, graph = windows(data, zero, zero, window=model_preset(config.model).window, horizon=1, counts=counts)
+    # Without `jit` every layer's draw would compile for itself.
+    return jax.jit(family.init)(jax.random.key(config.seed), history, graph)
 
 
-def _make_chunk(config: TrainConfig, predict: Predict, scales: Scales, optimizer, counts: tuple[int, int, int]):
-    """`(state, data, horizon=) -> (state, mean loss, mean gradient norm)`; one compile per horizon."""
+def _make_chunk(
+    config: TrainConfig, family: Family, scales: Scales, optimizer, mask: Mask, counts: tuple[int, int, int]
+) -> Callable[..., tuple[dict, Array, Array]]:
+    """See `Prepared.run_chunk`."""
     window = model_preset(config.model).window
     noise_unit = config.noise * jnp.stack(
         [scales.position_change, scales.position_change, scales.velocity_change, scales.velocity_change]
     )
 
     def loss_of(params: dict, data: Dataset, key: Key[Array, ""], horizon: int) -> Array:
-        k_scene, k_start, k_noise = jax.random.split(key, 3)
+        k_scene, k_start, k_noise, k_model = jax.random.split(key, 4)
         scenes, rows = data.states.shape[:2]
         scene = jax.random.randint(k_scene, (config.batch,), 0, scenes)
         start = jax.random.randint(k_start, (config.batch,), 0, rows - window - horizon + 1)
@@ -157,20 +251,24 @@ def _make_chunk(config: TrainConfig, predict: Predict, scales: Scales, optimizer
             moving = graph.present & (jnp.arange(sum(counts)) >= counts[0] + counts[1])
             noise = noise_unit * jax.random.normal(k_noise, history.shape)
             history = history + jnp.where(moving[:, None, :, None], noise, 0)
-        return multi_step_loss(predict(params, history, graph, horizon=horizon), truth, mask, scales)
+        return family.loss(params, history, truth, mask, graph, k_model)
 
     @partial(jax.jit, static_argnames="horizon")
-    def run_chunk(state: dict, data: Dataset, *, horizon: int):
+    def run_chunk(state: dict, data: Dataset, steps: int | Array, *, horizon: int):
         def one(state: dict, _: None):
-            key = jax.random.fold_in(jax.random.key(config.seed + 1), state["step"])
-            loss, gradient = jax.value_and_grad(loss_of)(state["params"], data, key, horizon)
-            updates, opt_state = optimizer.update(gradient, state["optimizer"], state["params"])
-            new = {
-                "params": optax.apply_updates(state["params"], updates),
-                "optimizer": opt_state,
-                "step": state["step"] + 1,
-            }
-            return new, (loss, optax.tree.norm(gradient))
+            step, raw = state["step"], state["raw" if config.average else "params"]
+            key = jax.random.fold_in(jax.random.key(config.seed + 1), step)
+            loss, gradient = jax.value_and_grad(loss_of)(raw, data, key, horizon)
+            updates, opt_state = optimizer.update(gradient, state["optimizer"], raw)
+            rate = 0.5 * config.learning_rate * (1 + jnp.cos(jnp.pi * step / steps))
+            raw = optax.apply_updates(raw, jax.tree.map(lambda update: -rate * update, updates))
+            new = {"params": raw, "optimizer": opt_state, "step": step + 1}
+            if config.average:
+                # The first steps leave the initial weights behind: the mean begins short and grows.
+                keep = jnp.minimum(config.average, (1 + step) / (10 + step))
+                new["params"] = jax.tree.map(lambda mean, now: mean + (1 - keep) * (now - mean), state["params"], raw)
+                new["raw"] = raw
+            return new, (loss, optax.tree.norm(free_leaves(gradient, mask)))
 
         state, (loss, norm) = jax.lax.scan(one, state, None, length=config.chunk)
         return state, loss.mean(), norm.mean()

@@ -16,21 +16,28 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from envs.config import SimulateConfig
 from envs.simulate import simulate_in_memory
 from envs.trajectories import AGENT, GOAL, Trajectories, edge_types
-from gnn.config import PRESETS, ModelConfig, model_preset
+from gnn.config import PRESETS, ModelConfig
 from gnn.decode import Integrator
 from gnn.features import Scales
 from gnn.graph import Graph, graph_of_edges
 from gnn.swarmnet import SwarmNet
 
-NAMES = tuple(PRESETS)
+NAMES = ("thesis-ch3", "thesis-ch5", "best", "best-all", "separable", "crowd")
+"""Presets that differ in structure."""
 INTEGRATOR = Integrator(dt=0.3, substeps=4, max_speed=3.0, max_acceleration=2.0)
 
 
 def tiny(name: str) -> ModelConfig:
     """A preset with the same parts and few weights."""
-    preset = model_preset(name)
+    preset = PRESETS[name]
     filters = (5, 6) if preset.convolutions else ()
-    return replace(preset, convolutions=filters, edge_hidden=(8, 7), message=6, node_hidden=(8, 9))
+    few = {
+        "convolutions": filters,
+        "edge_hidden": (8, 7),
+        "message": 2 if preset.additive else 6,
+        "node_hidden": (8, 9),
+    }
+    return replace(preset, **few, nearest=2 if preset.nearest else None)
 
 
 def scales() -> Scales:
@@ -67,7 +74,7 @@ def initial(config: ModelConfig, units: Scales, history: np.ndarray, graph: Grap
     rng = np.random.default_rng(seed)
 
     def draw(leaf: jax.ShapeDtypeStruct) -> np.ndarray:
-        size = 0.1 if leaf.ndim == 1 else np.prod(leaf.shape[:-1]) ** -0.5
+        size = np.prod(leaf.shape[:-1]) ** -0.5 if leaf.ndim > 1 else 0.1
         return rng.normal(0, size, leaf.shape).astype(np.float32)
 
     return jax.tree.map(draw, shapes)
@@ -86,10 +93,11 @@ def numpy_swarmnet(params: dict, config: ModelConfig, units: Scales, history: np
         return x @ layer["kernel"] + layer["bias"]
 
     def mlp(layers: dict, x: np.ndarray, hidden: int) -> np.ndarray:
-        for depth in range(len(layers)):
+        given = x
+        for depth in range(sum(name.startswith("layer") for name in layers)):
             x = dense(layers[f"layer{depth}"], x)
             x = np.maximum(x, 0) if depth < hidden else x
-        return x
+        return x + given @ layers["skip"]["kernel"] if "skip" in layers else x
 
     outputs = []
     for b in range(len(history)):
@@ -102,8 +110,9 @@ def numpy_swarmnet(params: dict, config: ModelConfig, units: Scales, history: np
             x = rows[:, v]
             for depth in range(len(config.convolutions)):
                 layer = params["conv"][f"layer{depth}"]
+                kernel = layer["kernel"].reshape(3, -1, len(layer["bias"]))
                 x = np.stack([
-                    np.maximum(sum(x[t + i] @ layer["kernel"][i] for i in range(3)) + layer["bias"], 0)
+                    np.maximum(sum(x[t + i] @ kernel[i] for i in range(3)) + layer["bias"], 0)
                     for t in range(len(x) - 2)
                 ])  # fmt: skip
             nodes.append(x[-1])
@@ -113,32 +122,56 @@ def numpy_swarmnet(params: dict, config: ModelConfig, units: Scales, history: np
                 out.append(np.zeros(4 if everyone else 2))
                 continue
             messages = {name: [] for name in offsets}
-            for name, offset in offsets.items():
+            turn, near = np.eye(2), np.zeros(config.message)
+            if config.frame and (velocity := rows[-1, i, 2:]).any():
+                ahead = velocity / np.linalg.norm(velocity)
+                turn = np.array([ahead, [-ahead[1], ahead[0]]])
+            square = np.array([((n - nodes[i])[:2] ** 2).sum() for n in nodes[first:]])
+            square[~masks["agent"][b, max(i - first, 0)]] = np.inf
+            within = np.sort(square)[: config.nearest].max() if config.nearest else np.inf
+            seen = {name: offset for name, offset in offsets.items() if config.context or name == "agent"}
+            for name, offset in seen.items():
                 for j in range(masks[name].shape[-1]) if i >= first else ():
-                    if not masks[name][b, i - first, j]:
+                    if not masks[name][b, i - first, j] or (name == "agent" and square[j] > within):
                         continue
                     to, of = nodes[i], nodes[offset + j]
                     pair = [to, of]
-                    if config.relative:
-                        away = (of - to)[:2]
+                    if config.frame:
+                        away = turn @ (of - to)[:2]
                         distance = np.sqrt(away @ away + 1e-8)
-                        pair += [of - to, away / distance, [np.log(distance + 0.02)]]
+                        speed = np.linalg.norm(to[2:])
+                        pair = [away, away / distance, [np.log(distance + 0.02)], turn @ of[2:], [speed]]
                     message = mlp(params["edge"][name], np.concatenate(pair), len(config.edge_hidden))
                     messages[name].append(message)
+                    if "near" in config.aggregate:
+                        far = (nodes[offset + j] - nodes[i])[:2]
+                        near += message * np.exp(-0.5 * far @ far / np.exp(2 * params["reach"][name]))
             nothing = np.zeros(config.message)
-            kinds = [name for name in offsets if masks[name].shape[-1]]
+            kinds = [name for name in seen if masks[name].shape[-1]]
             joined = []
             for how in config.aggregate:
                 if how == "sum":
                     joined.append(sum((m for name in kinds for m in messages[name]), nothing))
+                    continue
+                if how == "near":
+                    joined.append(near)
                     continue
                 join = {"mean": np.mean, "max": np.max}[how]
                 joined += [join(messages[name], axis=0) if messages[name] else nothing for name in kinds]
             total = np.concatenate(joined)
             if config.psi:
                 total = mlp(params["psi"], total, 1)
-            hidden = mlp(params["node"], np.concatenate([nodes[i], total]), len(config.node_hidden))
-            result = mlp(params["readout"], hidden, 0)
+
+            def node(*parts: np.ndarray) -> np.ndarray:
+                hidden = mlp(params["node"], np.concatenate(parts), len(config.node_hidden))
+                return mlp(params["readout"], hidden, 0)
+
+            own, ahead = nodes[i], turn[0]
+            if config.additive:
+                central = np.concatenate([np.zeros(2), own[2:]])
+                result = total.reshape(-1, 2).sum(axis=0) @ turn + node(own, ahead) - node(central, ahead)
+            else:
+                result = node(own, ahead, total) @ turn if config.frame else node(own, total)
             out.append(result * units["acceleration"] if config.normalise else result)
         outputs.append(out)
     return np.asarray(outputs)

@@ -116,6 +116,24 @@ def test_a_case_by_hand():
     np.testing.assert_allclose(found.by_step, (1, 3.6))
 
 
+def test_displacement_is_of_agents_who_stay():
+    """Two agents walk 1 and 3 m a row beside a goal that persistence predicts; the second leaves after row 2."""
+    data = blank_walk()
+    found = prediction_error(persistence, {}, data, window=1, horizons=(1, 2, 3))
+    assert found.paths == (5, 3, 1)  # from rows 0, 1 both, from row 2 the first; ...
+    np.testing.assert_allclose(found.fde, [(3 * 1 + 2 * 3) / 5, (2 * 2 + 6) / 3, 3])
+    np.testing.assert_allclose(found.ade, [(3 * 1 + 2 * 3) / 5, (2 * 1.5 + 4.5) / 3, 2])
+    np.testing.assert_allclose(found.displacement, found.fde)
+
+
+def blank_walk() -> Trajectories:
+    data = make_trajectories(scenes=1, rows=4, goals=1, obstacles=0, agents=2)
+    mask, position = np.ones_like(data.mask), np.zeros_like(data.position)
+    mask[0, 3, 2] = False
+    position[0, :, 1, 0], position[0, :, 2, 1] = np.arange(4), 3 * np.arange(4)
+    return replace(data, mask=mask, position=position, velocity=np.zeros_like(position))
+
+
 def test_persistence_over_one_step_is_one_by_definition():
     found = prediction_error(persistence, {}, published(), window=1, horizons=(1,))
     np.testing.assert_allclose(found.published_mean, 1, rtol=1e-5)

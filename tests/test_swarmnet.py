@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from learning import INTEGRATOR, NAMES, complete, initial, numpy_swarmnet, quick_compiles, random_swarm, scales, tiny
 
-from gnn.config import ModelConfig, model_preset
+from gnn.config import PRESETS, ModelConfig, model_preset
 from gnn.decode import make_predict
 from gnn.features import Scales
 from gnn.graph import Graph
@@ -72,13 +72,13 @@ def test_a_forward_pass_written_by_hand_gives_the_same(name: str, seed: int):
     history, _, graph = random_swarm(seed, COUNTS, window=config.window, absent=0.3)
     found = np.asarray(apply(params, history, graph))
     expected = numpy_swarmnet(params, config, scales(), history, graph)
-    assert found.shape == ((3, 7, 4) if name == "thesis-ch3" else (3, 4, 2))
+    assert found.shape == ((3, 7, 4) if config.output == "state_change" else (3, 4, 2))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
 
 
 @presets
 def test_the_full_presets_agree_with_the_forward_pass_by_hand(name: str):
-    config = model_preset(name)
+    config = PRESETS[name]
     history, _, graph = random_swarm(1, COUNTS, window=config.window)
     params = initial(config, scales(), history, graph)
     found = run(config, params, history, graph, scales())
@@ -89,10 +89,12 @@ def test_the_full_presets_agree_with_the_forward_pass_by_hand(name: str):
 @presets
 def test_parameters_are_a_plain_nested_dict_with_named_parts(name: str):
     _, _, params = network(name)
-    parts = {"edge/goal", "edge/obstacle", "edge/agent", "node", "readout"}
-    parts |= {"conv", "psi"} if name == "thesis-ch3" else set()
-    assert {path.split("/layer")[0] for path in paths(params)} == parts
-    assert all(path.endswith(("/kernel", "/bias")) for path in paths(params))
+    config = tiny(name)
+    parts = {"edge/agent", "node", "readout"} | ({"edge/goal", "edge/obstacle"} if config.context else set())
+    parts |= {"conv", "psi"} if config.psi else set()
+    parts |= {"reach/goal", "reach/obstacle", "reach/agent"} if "near" in config.aggregate else set()
+    assert {path.split("/layer")[0].removesuffix("/skip/kernel") for path in paths(params)} == parts
+    assert all(path.endswith(("/kernel", "/bias")) or path.startswith("reach/") for path in paths(params))
 
     def plain(tree) -> bool:
         return all(plain(v) for v in tree.values()) if type(tree) is dict else isinstance(tree, np.ndarray)
@@ -152,7 +154,7 @@ def test_ghosts_change_nothing_for_the_others(name: str, garbage: float):
     there = np.zeros((3, 12), bool)
     there[:, places] = present
     out = np.asarray(apply(params, padded, complete(there, more)))
-    if name == "thesis-ch3":
+    if config.output == "state_change":
         close(out[:, places], apply(params, history, graph))
         assert not out[:, [3, 4, 9, 10, 11]].any()
     else:
@@ -197,13 +199,21 @@ def test_moving_the_world_alone_is_seen(name: str):
     assert np.abs(difference).max() > 1e-2
 
 
-def test_the_relative_part_of_messages_does_not_see_where_the_world_is():
-    _, apply, params = network("best")
-    params = jax.tree.map(np.array, params)
-    for part in (*params["edge"].values(), params["node"]):
-        part["layer0"]["kernel"][:2] = 0  # own position
-    for part in params["edge"].values():
-        part["layer0"]["kernel"][4:6] = 0  # the sender's
+FRAMED = [name for name in NAMES if PRESETS[name].frame]
+
+
+def without_the_world(name: str) -> dict:
+    """Weights of a node function that sees neither where its agent is nor how it moves."""
+    params = jax.tree.map(np.array, network(name)[2])
+    for layer in ("layer0", "skip"):
+        params["node"][layer]["kernel"][:6] = 0  # position, velocity, heading
+    return params
+
+
+@pytest.mark.parametrize("name", FRAMED)
+def test_messages_do_not_see_where_the_world_is(name: str):
+    _, apply, _ = network(name)
+    params = without_the_world(name)
     history, _, graph = random_swarm(6, COUNTS)
     moved = history + np.array([8.0, -4.0, 0, 0], np.float32)
     out = np.asarray(apply(params, history, graph))
@@ -211,6 +221,29 @@ def test_the_relative_part_of_messages_does_not_see_where_the_world_is():
     assert np.abs(out).max() > 1e-2
     closer = history * np.array([0.5, 0.5, 1, 1], np.float32)
     assert np.abs(np.asarray(apply(params, closer, graph)) - out).max() > 1e-2
+
+
+@pytest.mark.parametrize("name", FRAMED)
+@settings(max_examples=8)
+@given(seed=SEEDS, angle=st.floats(-3.0, 3.0))
+def test_messages_turn_with_the_world(name: str, seed: int, angle: float):
+    config, _, _ = network(name)
+    params = without_the_world(name)
+    history, _, graph = random_swarm(seed, COUNTS, absent=0.2)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], np.float32)
+    turned = np.concatenate([history[..., :2] @ turn, history[..., 2:] @ turn], axis=-1)
+    units = replace(scales(), centre=jnp.zeros(2))
+    out = np.asarray(run(config, params, history, graph, units))
+    np.testing.assert_allclose(np.asarray(run(config, params, turned, graph, units)), out @ turn, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", FRAMED)
+def test_who_stands_faces_along_x(name: str):
+    config, apply, params = network(name)
+    history, _, graph = random_swarm(12, COUNTS)
+    history[..., 2:] = 0
+    expected = numpy_swarmnet(params, config, scales(), history, graph)
+    np.testing.assert_allclose(np.asarray(apply(params, history, graph)), expected, rtol=1e-5, atol=1e-5)
 
 
 # --- structure ---
@@ -234,6 +267,42 @@ def test_thesis_ch5_is_affine_in_the_state_before_its_first_relu():
     np.testing.assert_allclose(*mix(tiny("thesis-ch5"), 2.5), atol=1e-4)
 
 
+def test_without_context_goals_and_obstacles_are_not_seen():
+    config, apply, params = network("thesis-ch3-blind")
+    history, _, graph = random_swarm(13, COUNTS, window=config.window)
+    moved = history.copy()
+    moved[:, :, :3, :2] += 5
+    close(
+        agents_of("thesis-ch3-blind", apply(params, moved, graph)),
+        agents_of("thesis-ch3-blind", apply(params, history, graph)),
+    )
+
+
+def test_a_linear_path_beside_the_hidden_layers():
+    config = replace(tiny("best"), skip=True)
+    history, _, graph = random_swarm(14, COUNTS)
+    params = initial(config, scales(), history, graph)
+    expected = numpy_swarmnet(params, config, scales(), history, graph)
+    found = run(config, params, history, graph, scales())
+    np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-5, atol=1e-5)
+    assert set(params["node"]) == {"layer0", "layer1", "skip"}
+
+
+def test_dropped_neurons_are_drawn_from_the_key():
+    config = replace(tiny("best"), dropout=0.5)
+    history, _, graph = random_swarm(15, COUNTS)
+    params = initial(config, scales(), history, graph)
+    predict = jax.jit(make_predict(config, scales(), INTEGRATOR), static_argnames="horizon")
+    sure = [np.asarray(predict(params, history, graph, horizon=2)) for _ in range(2)]
+    np.testing.assert_array_equal(*sure)
+    one, again, other = (
+        np.asarray(predict(params, history, graph, horizon=2, key=jax.random.key(k))) for k in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(one, again)
+    assert np.abs(one - other).max() > 1e-3
+    assert np.abs(one - sure[0]).max() > 1e-3
+
+
 def test_best_is_not_affine_in_the_state():
     one, two = mix(tiny("best"), 2.5)
     assert np.abs(one - two).max() > 1e-2
@@ -249,8 +318,8 @@ def test_small_scenes_work(name: str, counts: tuple[int, int, int]):
     out = np.asarray(run(config, params, history, graph, scales()))
     np.testing.assert_allclose(out, numpy_swarmnet(params, config, scales(), history, graph), rtol=1e-5, atol=1e-5)
     senders = {"goal", "obstacle", "agent"}
-    assert set(params["edge"]) == {k for k, count in zip(("goal", "obstacle", "agent"), counts, strict=True) if count}
-    assert senders >= set(params["edge"])
+    seen = senders if config.context else {"agent"}
+    assert set(params["edge"]) == {k for k, n in zip(("goal", "obstacle", "agent"), counts, strict=True) if n} & seen
 
 
 @presets
@@ -285,11 +354,11 @@ def test_gradients_are_finite_where_agents_coincide(name: str):
 
 
 def test_presets_are_what_they_say():
-    assert model_preset("thesis-ch3").window == 5
-    assert model_preset("thesis-ch3").output == "state_change"
-    assert model_preset("thesis-ch5").aggregate == ("sum",)
-    assert model_preset("best").clip
-    with pytest.raises(SpecError, match="thesis-ch3, thesis-ch5, best"):
+    assert PRESETS["thesis-ch3"].window == 5
+    assert PRESETS["thesis-ch3"].output == "state_change"
+    assert PRESETS["thesis-ch5"].aggregate == ("sum",)
+    assert PRESETS["best"].clip
+    with pytest.raises(SpecError, match="thesis-ch3, thesis-ch3-blind, thesis-ch5, best"):
         model_preset("GAT")
     with pytest.raises(SpecError, match="window"):
         ModelConfig(window=4, convolutions=(8,))

@@ -15,8 +15,9 @@ from gnn.config import TrainConfig
 from gnn.decode import make_predict
 from gnn.evaluate import persistence, prediction_error
 from gnn.metrics import read_metrics
-from gnn.train import TrainError, train
+from gnn.train import TrainError, prepare, train
 from swarm_mjcf.errors import SpecError
+from swarmnet.bench_train import bench_loop, windows_of
 
 SHORT = TrainConfig(
     model="thesis-ch5",
@@ -107,9 +108,29 @@ def test_what_train_returns_is_what_load_model_finds(tmp_path: Path):
 def test_the_same_seed_gives_the_same_weights_and_another_seed_or_noise_others(tmp_path: Path):
     one, two = (train(SHORTEST, spring(), tmp_path / name).params for name in "ab")
     jax.tree.map(np.testing.assert_array_equal, one, two)
-    for change in ({"seed": 1}, {"noise": 0.5}):
+    for change in ({"seed": 1}, {"noise": 0.5}, {"average": 0.9}):
         other = train(replace(SHORTEST, **change), spring(), tmp_path / str(change)).params
         assert not np.array_equal(one["readout"]["layer0"]["kernel"], other["readout"]["layer0"]["kernel"])
+
+
+def test_the_weights_are_the_running_mean_of_those_that_learn(tmp_path: Path):
+    """By hand from the weights after every step: the decay is (1 + n) / (10 + n) until it reaches the one given."""
+    config = replace(SHORTEST, stage_steps=(6,), chunk=1, average=0.3)
+    raw, plain = [], prepare(replace(config, average=0.0), spring())
+    state = plain.start()
+    for _ in range(7):
+        raw.append(state["params"]["readout"]["layer0"]["kernel"])
+        state, _, _ = plain.run_chunk(state, plain.data, config.steps, horizon=1)
+    mean = np.asarray(raw[0], np.float64)
+    for n, now in enumerate(raw[1:]):
+        keep = min(0.3, (1 + n) / (10 + n))
+        mean = keep * mean + (1 - keep) * now
+    model = train(config, spring(), tmp_path)
+    np.testing.assert_allclose(model.params["readout"]["layer0"]["kernel"], mean, rtol=1e-5, atol=1e-7)
+    checkpoints = Checkpoints(tmp_path / "checkpoints", read_only=True)
+    saved = checkpoints.newest()[2]
+    np.testing.assert_allclose(saved["raw"]["readout"]["layer0"]["kernel"], raw[-1], rtol=1e-5, atol=1e-7)
+    jax.tree.map(np.testing.assert_array_equal, load_model(tmp_path / "checkpoints").params, saved["params"])
 
 
 def test_a_loss_that_is_not_finite_stops_and_leaves_the_last_checkpoint(tmp_path: Path):
@@ -163,7 +184,7 @@ def test_bad_settings_are_named():
     for field, value in [
         ("model", "gat"), ("horizons", (1, 2, 3)), ("stage_steps", (5, 4)), ("stage_steps", (0, 4)), ("batch", 0),
         ("chunk", 0), ("learning_rate", 0.0), ("learning_rate", float("nan")), ("clip_norm", -1.0), ("noise", -0.1),
-        ("checkpoint_seconds", 0.0),
+        ("average", 1.0), ("average", -0.1), ("checkpoint_seconds", 0.0),
     ]:  # fmt: skip
         with pytest.raises(SpecError):
             replace(SHORT, **{field: value})
@@ -177,3 +198,22 @@ def test_scaling_a_curriculum_keeps_whole_chunks():
     assert config.scaled(0.4).stage_steps == (2400, 800)
     assert config.scaled(0.01).stage_steps == (100, 100)
     assert config.scaled(0.4).steps == 3200
+
+
+# --- speed ---
+
+
+def test_the_bench_counts_windows_and_the_share_of_time_in_the_compiled_step():
+    rate = bench_loop(SHORTEST, spring())
+    assert rate.case == "thesis-ch5"
+    assert rate.windows_per_second > 0
+    assert 0 < rate.compiled_share < 1
+
+
+def test_what_keras_learns_from_is_every_window_and_the_row_after_it():
+    data = spring(3, rows=7)
+    history, after = windows_of(data)
+    assert history.shape == (6, 5, 3, 4)
+    states = np.concatenate([data.position, data.velocity], axis=-1)
+    np.testing.assert_array_equal(history[4], states[1, 1:6])
+    np.testing.assert_array_equal(after[4], states[1, 6])

@@ -1,0 +1,1 @@
+"""The rivals: Kipf's NRI and its decoder, LSTM, Seq2Seq."""
