@@ -15,7 +15,7 @@ from envs.engines import make_engine
 from envs.engines.engine import Engine
 from envs.experts.registry import make_expert
 from envs.state import State, make_state
-from gnn.config import model_preset
+from gnn.config import PRESETS
 from gnn.decode import make_policy
 from gnn.features import Scales
 from gnn.graph import graph_of_state
@@ -92,7 +92,7 @@ def _loop(engine: Engine, start: State, policy) -> Callable[[int], None]:
 
 
 def _swarmnet(spec: SceneSpec, start: State):
-    config, scales = model_preset("best"), Scales.ones()
+    config, scales = PRESETS["best"], Scales.ones()
     small = jax.tree.map(lambda x: x[:1, ...], start)
     nodes, graph = graph_of_state(small, goal=True)
     params = SwarmNet(config, scales).init(jax.random.key(0), nodes[:, None], graph)["params"]

@@ -19,9 +19,13 @@ from swarmnet.config import (
     Evaluate,
     Export,
     Import,
+    Learn,
     Merge,
+    Probe,
     Render,
     Report,
+    Reproduce,
+    Schedule,
     Simulate,
     Train,
 )
@@ -30,7 +34,10 @@ _MODULES: dict[type, str] = {
     Simulate: "swarmnet.commands.simulate",
     Merge: "swarmnet.commands.merge",
     Train: "swarmnet.commands.train",
+    Schedule: "swarmnet.commands.schedule",
     Evaluate: "swarmnet.commands.evaluate",
+    Learn: "swarmnet.commands.learn",
+    Probe: "swarmnet.commands.probe",
     Render: "swarmnet.commands.render",
     Demo: "swarmnet.commands.demo",
     Report: "swarmnet.commands.report",
@@ -38,12 +45,14 @@ _MODULES: dict[type, str] = {
     Bench: "swarmnet.commands.bench",
     Import: "swarmnet.commands.import_",
     Export: "swarmnet.commands.export",
+    Reproduce: "swarmnet.commands.reproduce",
 }
 """Each has a function `run(config) -> int`, the exit code."""
 
 
-# A positional argument that may be left out; configurations are standard library only and cannot say so themselves.
+# Positional arguments that may be left out; configurations are standard library only and cannot say so themselves.
 Evaluate.__annotations__["run"] = tyro.conf.Positional[Evaluate.__annotations__["run"]]
+Reproduce.__annotations__["name"] = tyro.conf.Positional[Reproduce.__annotations__["name"]]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,10 +1,12 @@
-"""Judging a policy beside a reference: contacts, collective motion, worst scenes, and prediction error for a model."""
+"""Judging a policy beside a reference: contacts, collective motion, worst scenes, and prediction error for a model; or
+a model's prediction alone, on recorded trajectories."""
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +24,15 @@ from envs.storage import save
 from envs.swarm_env import SwarmEnv, scene_keys
 from envs.trajectories import Trajectories, from_recording, versions
 from gnn.checkpoint import Model
-from gnn.decode import make_predict
-from gnn.evaluate import PredictionError, constant_velocity, persistence, prediction_error
+from gnn.evaluate import PredictionError
 from gnn.windows import Dataset, windows
 from swarm_mjcf.errors import SwarmError
 from swarmnet.closed_loop import Stage, replayed, roll_out
+from swarmnet.out_of_range import out_of_range
 from swarmnet.policies import EXPERT, Source, find_policy
-from swarmnet.progress import progress
+from swarmnet.recorded import holdout_of, predictions, sample_windows
 from swarmnet.results import commit, hardware, write_whole
+from swarmnet.selection import difference
 
 WORST = 5
 """Worst scenes that are listed."""
@@ -55,35 +58,50 @@ class Judgement:
     """File name of the policy's contact log in the run folder."""
     contacts: bool
     """Whether bodies collide, or contacts come from recorded positions."""
+    by_geometry: bool = False
+    """Whether contacts come from positions, because policy or reference is a recording."""
+    data: str | None = None
+    """File of the recorded trajectories that were predicted, where nothing was steered."""
+    said: tuple[str, ...] = ()
+    """Warnings: what is out of the range of a model's training data."""
     dt: float
     preset: str | None
     engine: str
     scenes: int
     steps: int
-    seed: int
+    seed: int | None
+    """Of the scenes; None for recorded ones."""
 
     def plain(self) -> dict:
-        """Plain JSON values, with what is needed to measure again."""
-        return {
-            "policy": self.policy, "reference": self.reference, "given": self.given,
-            "preset": self.preset, "engine": self.engine, "hardware": hardware(), "versions": versions(),
-            "commit": commit(),
-            "prediction": {
-                name: {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(error).items()}
-                for name, error in self.prediction.items()
-            },
-            "collisions": _plain(self.collisions), "collective": _plain(self.collective),
-            "worst": [
-                {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(scene).items()}
-                for scene in self.worst
-            ],
-            "contact_log": self.contact_log,
-            "contacts": self.contacts, "dt": self.dt, "scenes": self.scenes, "steps": self.steps, "seed": self.seed,
-        }  # fmt: skip
+        """Plain JSON values, with what is needed to measure again. What is not finite is None."""
+        return _finite(
+            {
+                "policy": self.policy, "reference": self.reference, "given": self.given, "data": self.data,
+                "preset": self.preset, "engine": self.engine, "hardware": hardware(), "versions": versions(),
+                "commit": commit(), "said": self.said,
+                "prediction": {
+                    name: {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(error).items()}
+                    for name, error in self.prediction.items()
+                },
+                "collisions": _plain(self.collisions), "collective": _plain(self.collective),
+                "worst": [asdict(scene) for scene in self.worst],
+                "contact_log": self.contact_log, "contacts": self.contacts, "by_geometry": self.by_geometry,
+                "dt": self.dt, "scenes": self.scenes, "steps": self.steps, "seed": self.seed,
+            }
+        )  # fmt: skip
 
     def write(self, folder: Path) -> None:
         """Writes FOLDER/evaluation.json."""
         write_whole(folder / "evaluation.json", json.dumps(self.plain(), indent=1))
+
+
+def _finite(value: Any) -> Any:
+    """The same with None in place of every number that is not finite: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _plain(reports: dict[str, dict[str, Estimate]]) -> dict:
@@ -94,7 +112,10 @@ def training_world(model: Model) -> SimulateConfig:
     """The settings of the data a model was trained on. Raises SwarmError if it was trained on something else."""
     settings = model.about["data"].get("simulate")
     if settings is None:
-        raise SwarmError("the model was not trained on simulated data; name the world to judge it in (--preset)")
+        raise SwarmError(
+            "the model was not trained on simulated data: judge its prediction on recorded trajectories that it has "
+            "not seen (--data HOLDOUT.h5), or name a world to let it steer in (--preset)"
+        )
     return from_plain(SimulateConfig, settings)
 
 
@@ -146,7 +167,7 @@ def judge_policy(
             if reference is not None:
                 done[reference.name] = perform(reference)
             done[source.name] = acted
-            _check_same_shape(done)
+            _check_same_scenes(done)
     elif reference is not None:
         done[reference.name] = perform(reference)
     _record(folder, done.get(reference.name) if reference else None, done.get(source.name), log_path.name)
@@ -158,14 +179,16 @@ def judge_policy(
         policy=source.name,
         reference=reference.name if reference else None,
         given={"policy": source.given, "reference": reference.given if reference else None},
-        prediction=_predictions(source, truth, label) if source.model is not None and reference is not None else {},
+        prediction=predictions(source, truth, label) if source.model is not None and reference is not None else {},
         collisions={name: collision_report(found) for name, found in done.items()} if acted else {},
         collective={name: collective_report(collective_measures(found)) for name, found in done.items()}
         if acted
         else {},
         worst=worst_scenes(acted, WORST) if acted else [],
         contact_log=log_path.name if acted else None,
-        contacts=source.recording is not None or stage.world.scene.contacts,
+        contacts=by_geometry or stage.world.scene.contacts,
+        by_geometry=by_geometry,
+        said=_said(source, truth),
         dt=truth.dt,
         preset=stage.simulate.preset if stage.simulate else None,
         engine=str((acted or truth).provenance.get("engine", "none")),
@@ -175,11 +198,51 @@ def judge_policy(
     )
 
 
-def _check_same_shape(done: dict[str, Trajectories]) -> None:
+def judge_recorded(source: Source, data: Path, folder: Path, *, label: str = "") -> Judgement:
+    """Judges a model's prediction on recorded trajectories and records in `folder` what is drawn of it.
+
+    rollouts/truth.h5 and rollouts/predicted.h5 hold some windows (`swarmnet.recorded.sample_windows`). Raises what
+    `swarmnet.recorded.holdout_of` raises.
+    """
+    trajectories, said = holdout_of(source, data)
+    assert source.model is not None
+    errors = predictions(source, trajectories, label)
+    _record(folder, None, None, "")
+    sample_windows(source.model, trajectories, folder)
+    return Judgement(
+        policy=source.name,
+        reference=None,
+        given={"policy": source.given, "reference": None},
+        prediction=errors,
+        collisions={},
+        collective={},
+        worst=[],
+        contact_log=None,
+        contacts=False,
+        data=str(data),
+        said=tuple(said),
+        dt=trajectories.dt,
+        preset=None,
+        engine="none",
+        scenes=len(trajectories),
+        steps=trajectories.position.shape[1] - 1,
+        seed=None,
+    )
+
+
+def _said(source: Source, truth: Trajectories) -> tuple[str, ...]:
+    line = out_of_range(source.model.about.get("range"), truth) if source.model is not None else None
+    return (line,) if line else ()
+
+
+def _check_same_scenes(done: dict[str, Trajectories]) -> None:
+    """Raises SwarmError when policy and reference differ in size, in dt, or in where anybody starts."""
     shapes = {name: found.position.shape[:3] for name, found in done.items()}
     if len(set(shapes.values())) > 1:
         told = ", ".join(f"{name} has {s} scenes of {t} rows and {v} nodes" for name, (s, t, v) in shapes.items())
         raise SwarmError(f"policy and reference cannot be compared: {told}")
+    if len(done) == 2 and (different := difference(*done.values())):
+        raise SwarmError(f"policy and reference cannot be compared: they have {different}")
 
 
 def _record(folder: Path, reference: Trajectories | None, acted: Trajectories | None, log: str) -> None:
@@ -189,7 +252,9 @@ def _record(folder: Path, reference: Trajectories | None, acted: Trajectories | 
             (folder / "rollouts" / name).unlink(missing_ok=True)
         else:
             save(folder / "rollouts" / name, found)
-    for name in ("rollouts/sweep_truth.h5", "rollouts/sweep_predicted.h5", "contacts.csv", "contacts.parquet"):
+    for name in ("sweep_truth.h5", "sweep_predicted.h5", "truth.h5", "predicted.h5"):
+        (folder / "rollouts" / name).unlink(missing_ok=True)
+    for name in ("contacts.csv", "contacts.parquet"):
         if acted is None or name != log:
             (folder / name).unlink(missing_ok=True)
 
@@ -204,24 +269,6 @@ def _check_model(model: Model, stage: Stage) -> None:
             f"the model was trained at dt {model.integrator.dt} s with {model.integrator.substeps} substeps, this "
             f"world has {scene.dt} s with {scene.substeps}"
         )
-
-
-def _predictions(source: Source, truth: Trajectories, label: str) -> dict[str, PredictionError]:
-    """Prediction error of the model and of the baselines on the reference's trajectories."""
-    model = source.model
-    assert model is not None
-    predictors = {
-        source.name: (make_predict(model.config, model.scales, model.integrator), model.params),
-        "constant velocity": (constant_velocity(truth.dt), {}),
-        "persistence": (persistence, {}),
-    }
-    found = {}
-    for row, (predict, params) in predictors.items():
-        with progress(f"{label}predict, {row}") as update:
-            found[row] = prediction_error(
-                predict, params, truth, window=model.config.window, progress=lambda a, b, update=update: update(a, b)
-            )
-    return found
 
 
 def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, seed: int) -> None:
@@ -245,7 +292,7 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
     )
     recording = jax.device_get(make_rollout(env, make_expert(world.expert), steps=steps)(None, start, keys))
     truth = from_recording(recording, world.scene, {"policy": "expert", "seed": seed, "world": plain(world)})
-    predict = make_predict(model.config, model.scales, model.integrator)
+    predict = model.predict
     first = model.config.window
     scene, zero = jnp.arange(4), jnp.zeros(4, jnp.int32)
     history, future, _, graph = windows(
@@ -265,21 +312,12 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
 
 def tables(judgement: Judgement) -> str:
     """What was measured, as text."""
-    lines = []
+    lines = [f"warning: {line}" for line in judgement.said]
     if judgement.prediction:
-        horizons = next(iter(judgement.prediction.values())).horizons
-        lines += [
-            f"normalized prediction error (published metric), dt {judgement.dt} s, {judgement.scenes} unseen scenes",
-            "  " + " " * 20 + "".join(f"{h:>4} steps mean / median   " for h in horizons),
-        ]
-    for row, e in judgement.prediction.items():
-        cells = (
-            f"{mean:14.4g} / {median:<9.4g}" for mean, median in zip(e.published_mean, e.published_median, strict=True)
-        )
-        lines.append(f"  {row:20}" + "".join(cells))
+        lines += _prediction_lines(judgement)
     if not judgement.collisions:
         return "\n".join(lines)
-    how = "positions replayed" if judgement.engine == "none" else "closed loop in physics"
+    how = "contacts from positions" if judgement.by_geometry else "closed loop in physics"
     scenes = f"{judgement.scenes} scenes, {judgement.steps} steps of {judgement.dt:g} s"
     lines.append(f"{how}, {scenes}" + ("" if judgement.contacts else " (contacts are off here)"))
     lines += _side_by_side(judgement.collisions)
@@ -292,6 +330,27 @@ def tables(judgement: Judgement) -> str:
         for w in judgement.worst
     ]
     return "\n".join(lines)
+
+
+def _prediction_lines(judgement: Judgement) -> list[str]:
+    errors = judgement.prediction
+    first = next(iter(errors.values()))
+    what = f"{judgement.scenes} scenes of {judgement.data}" if judgement.data else f"{judgement.scenes} unseen scenes"
+
+    def cells(pairs: Iterable[tuple[float, float]]) -> str:
+        return "".join(f"{one:14.4g} / {other:<9.4g}" for one, other in pairs)
+
+    head = "  " + " " * 20 + "".join(f"{h:>4} steps {{}}" for h in first.horizons)
+    lines = [
+        f"normalized prediction error (published metric), dt {judgement.dt:g} s, {what}",
+        head.replace("{}", "mean / median   "),
+    ]
+    for row, e in errors.items():
+        lines.append(f"  {row:20}" + cells(zip(e.published_mean, e.published_median, strict=True)))
+    counts = ", ".join(map(str, first.paths))
+    lines += [f"displacement of agents [m], {counts} paths", head.replace("{}", " ADE / FDE      ")]
+    lines += [f"  {row:20}" + cells(zip(e.ade, e.fde, strict=True)) for row, e in errors.items()]
+    return lines
 
 
 def _side_by_side(reports: dict[str, dict[str, Estimate]]) -> list[str]:

@@ -58,7 +58,7 @@ class Source:
     @property
     def acts(self) -> bool:
         """Whether it can steer agents; a model that predicts changes of state cannot, nor can a recording."""
-        return self.recording is None and (self.model is None or self.model.config.output == "acceleration")
+        return self.recording is None and (self.model is None or self.model.config.acts)
 
     def policy(self, world: World) -> tuple[Policy, object]:
         """The policy for a world, and its parameters. Raises SwarmError for what cannot act."""

@@ -1,65 +1,38 @@
 """RUN/report.html: one self-contained page of what a run folder holds. Its fixed words are in report.html."""
 
 import base64
-import json
 import mimetypes
 import platform
 import re
 import shlex
-from dataclasses import MISSING, dataclass, fields
 from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from envs.storage import load
 from envs.trajectories import versions
-from gnn.checkpoint import Checkpoints
 from gnn.config import TrainConfig
-from gnn.metrics import read_metrics
 from swarm_mjcf.errors import SwarmError
-from swarmnet.config import Demo, Evaluate, Simulate, Train
-from swarmnet.figures import FigureFile, make_figures, read_evaluation
+from swarmnet.figures import FigureFile, make_figures
 from swarmnet.figures_collective import make_collective_figures
-from swarmnet.report_tables import collective_table, collision_cells, interval_of, number, shown, worst_table
+from swarmnet.figures_recorded import make_recorded_figures
+from swarmnet.report_commands import commands, render_command, two_recordings
+from swarmnet.report_facts import Facts, gather
+from swarmnet.report_tables import (
+    collective_table,
+    collision_cells,
+    interval_of,
+    number,
+    plain_words,
+    prediction_tables,
+    shown,
+    worst_table,
+)
 from swarmnet.results import commit, hardware, write_whole
 from swarmnet.videos import VideoFile, find_videos
 
-
-@dataclass(frozen=True)
-class Facts:
-    """What a run folder says; None where it holds nothing of the kind."""
-
-    run: Path
-    about: dict | None
-    """Of the newest checkpoint."""
-    evaluation: dict | None
-    metrics: list[dict]
-    counts: tuple[int, int, int] | None
-    """Goals, obstacles and agents of the judged scenes."""
-    demo: dict | None
-    """Settings of `swarmnet demo`, when it made the folder."""
-
-    @property
-    def model(self) -> str:
-        """The policy's row name."""
-        e = self.evaluation or {}
-        return e.get("policy") or next(iter(e.get("prediction", {})), "model")
-
-    @property
-    def reference(self) -> str:
-        """The row name of what it is judged by."""
-        return (self.evaluation or {}).get("reference") or "expert"
-
-    def pair(self, figure: str) -> tuple[dict, dict] | None:
-        """Estimates of policy and reference, where both were measured; contact figures only with contacts on."""
-        e = self.evaluation or {}
-        reports = e.get("collisions") or {}
-        if not {self.reference, self.model} <= set(reports) or ("contact" in figure and not e.get("contacts")):
-            return None
-        both = reports[self.model].get(figure), reports[self.reference].get(figure)
-        return both if all(both) else None
+_FIGURES = (make_figures, make_collective_figures, make_recorded_figures)
 
 
 def write_report(run: str | Path) -> Path:
@@ -71,7 +44,7 @@ def write_report(run: str | Path) -> Path:
     run = Path(run)
     if not run.is_dir():
         raise SwarmError(f"{run}: no such run folder; `swarmnet demo` makes one")
-    facts = _gather(run)
+    facts = gather(run)
     page = _filled(
         {
             "title": escape(f"Run {run.resolve().name}"),
@@ -80,9 +53,11 @@ def write_report(run: str | Path) -> Path:
             "lead": _lead(facts),
             "tiles": _tiles(facts),
             **_missing(facts),
-            "figures": "".join(_figure(figure) for figure in make_figures(run) + make_collective_figures(run)),
-            "videos": "".join(_video(video, first=not k) for k, video in enumerate(find_videos(run))),
-            **_prediction(facts),
+            "figures": "".join(_figure(figure) for make in _FIGURES for figure in make(run)),
+            "windows" if facts.recorded else "videos": "".join(
+                _video(video, first=not k) for k, video in enumerate(find_videos(run))
+            ),
+            **prediction_tables(facts.evaluation, facts.model),
             **collision_cells(facts.evaluation),
             **collective_table(facts.evaluation),
             **worst_table(facts.evaluation),
@@ -104,24 +79,6 @@ def _filled(values: dict[str, str]) -> str:
     return Template(text).substitute(values)
 
 
-def _gather(run: Path) -> Facts:
-    about = counts = demo = None
-    if (run / "checkpoints").is_dir():
-        checkpoints = Checkpoints(run / "checkpoints", read_only=True)  # a training may be saving beside us
-        newest = checkpoints.newest()
-        about = None if newest is None else newest[1] | {"step": newest[0]}
-        checkpoints.close()
-    for name in ("learned.h5", "expert.h5"):
-        if (run / "rollouts" / name).exists():
-            counts = load(run / "rollouts" / name, scenes=1).counts
-    if (run / "config.json").exists():
-        try:
-            demo = json.loads((run / "config.json").read_text())
-        except (OSError, ValueError) as error:
-            raise SwarmError(f"{run / 'config.json'}: cannot be read ({error})") from error
-    return Facts(run, about, read_evaluation(run), read_metrics(run / "metrics.jsonl"), counts, demo)
-
-
 def _lead(facts: Facts) -> str:
     """One paragraph in plain words."""
     said = []
@@ -141,9 +98,11 @@ def _lead(facts: Facts) -> str:
         recorded = str(e.get("given", {}).get("policy")).endswith(".h5")
         judged = f"judged on {e['scenes']} scenes that it had never seen (seed {e['seed']})"
         judged = f"replayed from recorded positions of {e['scenes']} scenes" if recorded else judged
+        if facts.recorded:
+            judged = f"judged by its prediction of {e['scenes']} recorded scenes ({escape(facts.recorded)})"
         said.append(
-            f"{'It' if rows else _who(facts.model)} was {judged}, {e['steps']} control steps of {e['dt']:g} s each"
-            f"{crowd if agents else ''}."
+            f"{'It' if rows else _who(facts.model)} was {judged}, {e['steps']} {'' if facts.recorded else 'control '}"
+            f"steps of {e['dt']:g} s each{crowd if agents else ''}."
         )
         if both := facts.pair("final_goal_distance"):
             said.append(
@@ -164,6 +123,10 @@ def _lead(facts: Facts) -> str:
                 for h in near
             ]  # fmt: skip
             said.append("Predicting without ever being corrected, its normalized error is " + " and ".join(parts) + ".")
+        if facts.recorded:
+            ends = [f"{number(row['fde'][-1])} m ({escape(name)})" for name, row in rows.items()]
+            seconds = rows[first]["horizons"][-1] * e["dt"]
+            said.append(f"After {seconds:.3g} s it is {ends[0]} off on average; {' and '.join(ends[1:])}.")
     return " ".join(said) or "This folder holds no trained model and no evaluation yet."
 
 
@@ -208,16 +171,20 @@ def _tiles(facts: Facts) -> str:
                 beside = "<br>".join(f"{escape(other)} {number(_error(rows[other], horizon))}" for other in others)
                 label = f"Prediction error, {horizon} steps"
                 tile(label, number(_error(rows[name], horizon)), beside)
+        if facts.recorded:
+            beside = "<br>".join(f"{escape(other)} {number(rows[other]['fde'][-1])} m" for other in others)
+            seconds = rows[name]["horizons"][-1] * (facts.evaluation or {})["dt"]
+            tile(f"Displacement after {seconds:.3g} s", f"{number(rows[name]['fde'][-1])} m", beside)
     return "".join(tiles)
 
 
 def _missing(facts: Facts) -> dict[str, str]:
     """What is not there and could be."""
-    steered = _two_recordings(facts.run)
+    steered = two_recordings(facts.run)
     found = {
         "no_model": "" if facts.about or (facts.evaluation and not facts.evaluation["prediction"]) else "yes",
         "no_evaluation": "" if facts.evaluation else "yes",
-        "no_videos": escape(_render(facts.run)) if steered and not find_videos(facts.run) else "",
+        "no_videos": escape(render_command(facts.run)) if steered and not find_videos(facts.run) else "",
     }
     return found | {"missing": "".join(found.values())}
 
@@ -244,39 +211,12 @@ def _figure(figure: FigureFile) -> str:
     return f'<figure class="{kind}"><h3>{escape(figure.title)}</h3>{image}<figcaption>{caption}</figcaption></figure>'
 
 
-def _prediction(facts: Facts) -> dict[str, str]:
-    """The two tables of prediction error."""
-    e = facts.evaluation
-    if not e or not e["prediction"]:
-        return {}
-    return {
-        "prediction": _error_table(e["prediction"], "published", facts.model),
-        "prediction_agents": _error_table(e["prediction"], "agents", facts.model),
-        "prediction_of": f"dt = {e['dt']:g} s, {e['scenes']} unseen scenes",
-    }
-
-
-def _error_table(rows: dict[str, dict], metric: str, model: str) -> str:
-    horizons = rows[model]["horizons"]
-    head = "".join(f"<th>{h} step{'s' * (h > 1)}</th>" for h in horizons)
-    lines = []
-    for name, error in rows.items():
-        pairs = zip(error[f"{metric}_mean"], error[f"{metric}_median"], strict=True)
-        cells = "".join(f"<td>{number(mean)}<br><small>{number(median)}</small></td>" for mean, median in pairs)
-        kind = ' class="model"' if name == model else ""
-        lines.append(f"<tr{kind}><th>{escape(name)}</th>{cells}</tr>")
-    windows = "".join(f"<td><small>{count}</small></td>" for count in rows[model]["windows"])
-    lines.append(f"<tr><td><small>windows</small></td>{windows}</tr>")
-    table = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(lines)}</tbody>"
-    return f'<div class="table"><table>{table}</table></div>'
-
-
 def _settings(facts: Facts) -> str:
     """Everything that was set, as cards that open."""
     e, about = facts.evaluation or {}, facts.about or {}
     data = about.get("data", {})
     world = data.get("world", {})
-    judged = {key: e.get(key) for key in ("preset", "engine", "scenes", "steps", "dt", "seed", "contacts")}
+    judged = {key: e.get(key) for key in ("data", "preset", "engine", "scenes", "steps", "dt", "seed", "contacts")}
     counts = dict(zip(("goals", "obstacles", "agents"), facts.counts or (), strict=False))
     software = {"commit": e.get("commit") or commit(), "python": platform.python_version()}
     cards: dict[str, dict[str, Any]] = {
@@ -293,74 +233,10 @@ def _settings(facts: Facts) -> str:
     shown = []
     for title, values in cards.items():
         known = {k: v for k, v in values.items() if v is not None}
-        items = "".join(f"<dt>{escape(k)}</dt><dd>{escape(_plain(v))}</dd>" for k, v in known.items())
+        items = "".join(f"<dt>{escape(k)}</dt><dd>{escape(plain_words(v))}</dd>" for k, v in known.items())
         if items:
             shown.append(f'<details class="card"><summary>{escape(title)}</summary><dl>{items}</dl></details>')
     return "".join(shown)
-
-
-def commands(facts: Facts) -> list[tuple[str, str]]:
-    """(command, what it makes) for everything on the page, in order; all of them parse."""
-    run, about, e = facts.run, facts.about or {}, facts.evaluation
-    data = run / "data.h5"
-    found = []
-    if facts.demo and {"name", "scenes", "test_scenes"} <= set(facts.demo):
-        known = {k: v for k, v in facts.demo.items() if k != "videos"}
-        found.append((["swarmnet", "demo", *_flags(Demo, known)], "everything on this page"))
-    elif "simulate" in about.get("data", {}):
-        simulated = {k: v for k, v in about["data"]["simulate"].items() if k not in ("threads", "chunk")}
-        found.append((["swarmnet", "simulate", *_flags(Simulate, simulated | {"out": data})], "training data"))
-        all_scenes, kept = simulated["scenes"], simulated["scenes"] - about["data"]["scenes"]
-        train: dict[str, Any] = about["train"] | {"run": run}
-        if 0 < kept < all_scenes and kept != max(1, round(0.05 * all_scenes)):
-            train["validation"] = kept / all_scenes
-        found.append((["swarmnet", "train", str(data), *_flags(Train, train)], "model and learning curves"))
-    if e:
-        judged = {key: e[key] for key in ("scenes", "steps", "seed", "preset") if key in e} | _given(facts)
-        if e.get("preset") == about.get("data", {}).get("simulate", {}).get("preset"):
-            judged.pop("preset", None)  # the model's training world, whatever else was set there
-        elif facts.counts and judged.get("preset"):
-            judged |= dict(zip(("num_obstacles", "num_agents"), facts.counts[1:], strict=True))
-        found.append((["swarmnet", "evaluate", str(run), *_flags(Evaluate, judged)], "rollouts, tables, figures"))
-    found.append((["swarmnet", "report", str(run)], "this page and figures/"))
-    lines = [(shlex.join(words), comment) for words, comment in found]
-    return [*lines, (_render(run), "one video")] if _two_recordings(run) else lines
-
-
-def _two_recordings(run: Path) -> bool:
-    return all((run / "rollouts" / f"{name}.h5").exists() for name in ("expert", "learned"))
-
-
-def _given(facts: Facts) -> dict[str, str]:
-    """Policy and reference as they were named; a run's own model needs no name."""
-    given = (facts.evaluation or {}).get("given")
-    if not given:
-        return {}
-    named = {"reference": given["reference"] or "none"}
-    own = facts.evaluation and facts.evaluation["prediction"] and Path(given["policy"]).resolve() == facts.run.resolve()
-    return named if own else named | {"policy": given["policy"]}
-
-
-def _render(run: Path) -> str:
-    rollouts = run / "rollouts"
-    words = ["swarmnet", "render", str(rollouts / "expert.h5"), str(rollouts / "learned.h5")]
-    return shlex.join([*words, "--scene", "0", "--out", str(run / "videos" / "mine.mp4")])
-
-
-def _flags(kind: type, values: dict[str, Any]) -> list[str]:
-    """Command-line flags for the values that differ from a configuration's defaults; None means the default."""
-    words: list[str] = []
-    for field in fields(kind):
-        value = values.get(field.name)
-        value = tuple(value) if isinstance(value, list) else value
-        if value is None or field.default is MISSING or value == field.default:
-            continue
-        flag = field.name.replace("_", "-")
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-        else:
-            words += [f"--{flag}", *(str(item) for item in (value if isinstance(value, tuple) else (value,)))]
-    return words
 
 
 def _notes(facts: Facts) -> dict[str, str]:
@@ -369,8 +245,9 @@ def _notes(facts: Facts) -> dict[str, str]:
     planned = sum(about["train"]["stage_steps"]) if about else 0
     full = TrainConfig().steps
     found = {
-        "note_contacts_off": e and not e.get("contacts", True),
-        "note_cannot_steer": e and not e.get("collisions"),
+        "note_said": escape(" ".join(f"{line[:1].upper()}{line[1:]}." for line in (e or {}).get("said") or ())),
+        "note_contacts_off": e and not e.get("contacts", True) and not facts.recorded,
+        "note_cannot_steer": e and not e.get("collisions") and not facts.recorded,
         "note_one_seed": e and e["prediction"],
         "note_open_loop": e and e["prediction"] and e.get("collisions"),
         "note_unfinished": f"{about['step']} of {planned}" if about and about["step"] < planned else "",
@@ -383,14 +260,6 @@ def _notes(facts: Facts) -> dict[str, str]:
 def _error(row: dict, horizon: int) -> float | None:
     """The published mean at a horizon."""
     return row["published_mean"][row["horizons"].index(horizon)] if horizon in row["horizons"] else None
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, list | tuple):
-        return ", ".join(_plain(item) for item in value) or "none"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _data_uri(path: Path) -> str:

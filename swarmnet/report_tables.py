@@ -43,6 +43,38 @@ def worst_table(evaluation: dict | None) -> dict[str, str]:
     return {"worst": "".join(rows), "contact_log": escape(e.get("contact_log") or "")}
 
 
+def prediction_tables(evaluation: dict | None, model: str) -> dict[str, str]:
+    """Prediction error in both normalisations and in metres; the row `model` stands out."""
+    e = evaluation
+    if not e or not e["prediction"]:
+        return {}
+    rows = e["prediction"]
+    what = f"{e['scenes']} scenes of {escape(e['data'])}" if e.get("data") else f"{e['scenes']} unseen scenes"
+    metres = all("ade" in row for row in rows.values())  # older evaluations have none
+    return {
+        "prediction": _error_table(rows, ("published_mean", "published_median", "windows"), model),
+        "prediction_agents": _error_table(rows, ("agents_mean", "agents_median", "windows"), model),
+        "displacement": _error_table(rows, ("ade", "fde", "paths"), model) if metres else "",
+        "prediction_of": f"dt = {e['dt']:g} s, {what}",
+    }
+
+
+def _error_table(rows: dict[str, dict], columns: tuple[str, str, str], model: str) -> str:
+    """A row for each predictor, a column for each horizon; two figures to a cell, their number of cases below."""
+    horizons, (large, small, cases) = rows[model]["horizons"], columns
+    head = "".join(f"<th>{h} step{'s' * (h > 1)}</th>" for h in horizons)
+    lines = []
+    for name, error in rows.items():
+        pairs = zip(error[large], error[small], strict=True)
+        cells = "".join(f"<td>{number(one)}<br><small>{number(other)}</small></td>" for one, other in pairs)
+        kind = ' class="model"' if name == model else ""
+        lines.append(f"<tr{kind}><th>{escape(name)}</th>{cells}</tr>")
+    counted = "".join(f"<td><small>{count}</small></td>" for count in rows[model][cases])
+    lines.append(f"<tr><td><small>{cases}</small></td>{counted}</tr>")
+    table = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(lines)}</tbody>"
+    return f'<div class="table"><table>{table}</table></div>'
+
+
 def _cell(estimate: dict | None) -> str:
     return "<td></td>" if estimate is None else f"<td>{shown(estimate, interval=False)}<br>{interval_of(estimate)}</td>"
 
@@ -54,6 +86,15 @@ def number(value: float | int | None) -> str:
     if 1000 <= abs(value) < 1e6 or value == 0:
         return f"{value:.0f}"
     return f"{value:#.3g}".removesuffix(".") if abs(value) >= 1 else f"{value:.3g}"
+
+
+def plain_words(value: object) -> str:
+    """A setting as people write it."""
+    if isinstance(value, list | tuple):
+        return ", ".join(plain_words(item) for item in value) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def shown(estimate: dict, *, interval: bool = True) -> str:

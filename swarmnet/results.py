@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,8 @@ class Row:
     std: float | None = None
     reference: float | None = None
     unit: str = ""
+    more: dict = field(default_factory=dict)
+    """What else a reader must know of this figure; stands beside the other entries in the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,14 +38,15 @@ class Results:
     """Control step [s]; None where it has no meaning."""
     seeds: list[int] = field(default_factory=list)
     profile: str = "default"
+    more: dict = field(default_factory=dict)
+    """Further entries of the document, such as `missing`; they also replace what is found out when writing (`command`,
+    `commit`, `hardware`, `versions`) where the figures are of another day."""
 
 
 def write_results(path: str | Path, results: Results) -> None:
     """Writes JSON, whole or not at all. Non-finite values become null."""
     path = Path(path)
-    rows = [
-        {k: None if isinstance(v, float) and v - v != 0 else v for k, v in asdict(row).items()} for row in results.rows
-    ]
+    rows = [_flat(row) for row in results.rows]
     document = {
         "name": results.name,
         "command": _command(sys.argv[1:]),
@@ -53,9 +57,16 @@ def write_results(path: str | Path, results: Results) -> None:
         "versions": {"python": platform.python_version(), **versions()},
         "dt": results.dt,
         "seeds": results.seeds,
+        **results.more,
         "rows": rows,
     }
     write_whole(path, json.dumps(document, indent=1) + "\n")
+
+
+def _flat(row: Row) -> dict:
+    values = asdict(row)
+    more = values.pop("more")
+    return {k: None if isinstance(v, float) and v - v != 0 else v for k, v in (values | more).items()}
 
 
 def _command(arguments: list[str]) -> str:
@@ -131,6 +142,7 @@ def render_page(folder: str | Path) -> str:
             f"{machine['cores']} cores, {', '.join(machine['devices'])}, mujoco {used['mujoco']}, jax {used['jax']}"
             + (f", dt {document['dt']} s" if document["dt"] else "")
             + (f", seeds {', '.join(map(str, document['seeds']))}" if document["seeds"] else ""),
+            *(f"\n{text}" for text in _remarks(document)),
             "",
             "| | " + " | ".join(names) + " |",
             "|---|" + "---:|" * len(names),
@@ -138,6 +150,27 @@ def render_page(folder: str | Path) -> str:
         for column in columns:
             lines.append(f"| {column} | " + " | ".join(_cell(cells.get((name, column))) for name in names) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _remarks(document: dict) -> list[str]:
+    """What a reader must know before the figures."""
+    smoke = ["**Smoke run (profile `quick`), not to be quoted.**"] if document["profile"] == "quick" else []
+    return [*smoke, *([document["notes"]] if "notes" in document else []), *unfinished(document)]
+
+
+def unfinished(document: Mapping) -> list[str]:
+    """A line for the cells (row, data, seed) that a document names as missing, and one for each that failed."""
+    found: dict[str, dict[str, list[str]]] = {}
+    missing = document.get("missing", [])
+    for cell in missing:
+        found.setdefault(cell["row"], {}).setdefault(cell["data"], []).append(str(cell["seed"]))
+    rows = (
+        f"{row}: " + ", ".join(f"{data} ({' '.join(seeds)})" for data, seeds in by_data.items())
+        for row, by_data in found.items()
+    )
+    lines = [f"{len(missing)} missing cells (seeds): " + "; ".join(rows)] if missing else []
+    failed = document.get("failed", [])
+    return lines + [f"failed: {one['row']}, {one['data']}, seed {one['seed']}: {one['reason']}" for one in failed]
 
 
 def _cell(row: dict | None) -> str:

@@ -97,10 +97,8 @@ def _compared(headers: Sequence[Header], scenes: Sequence[int], titles: Sequence
                 )
     recordings = [read_scenes(header.path, [scene])[0] for header in headers]
     for header, recording in zip(headers[1:], recordings[1:], strict=True):
-        if difference := _difference(recordings[0], recording):
-            raise SwarmError(
-                f"{first.path} and {header.path} do not hold the same scenes: scene {scene} has {difference}"
-            )
+        if found := difference(recordings[0], recording):
+            raise SwarmError(f"{first.path} and {header.path} do not hold the same scenes: scene {scene} has {found}")
     named = [f"{title} · scene {scene}" for title in titles]
     rest = zip(recordings[1:], named[1:], strict=True)
     return [Panel(recordings[0], named[0]), *(Panel(r, n, recordings[0], titles[0]) for r, n in rest)]
@@ -134,7 +132,7 @@ def _need_scene(header: Header, scene: int) -> None:
         raise SpecError("scene", scene, f"what {header.path} holds: {only}")
 
 
-def _difference(one: Trajectories, other: Trajectories) -> str | None:
+def difference(one: Trajectories, other: Trajectories) -> str | None:
     """In what two recordings of one scene differ before anything has moved, or None."""
     if one.dt != other.dt:
         return f"dt {one.dt:g} s in one and {other.dt:g} s in the other"

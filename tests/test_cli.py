@@ -13,7 +13,10 @@ from swarm_mjcf.errors import SwarmError
 from swarmnet.cli import main
 from swarmnet.results import Results, Row, write_results
 
-COMMANDS = ("simulate", "merge", "import", "export", "train", "evaluate", "render", "demo", "report", "doctor", "bench")
+COMMANDS = (
+    "simulate", "merge", "import", "export", "train", "schedule", "evaluate", "learn", "probe", "render", "demo",
+    "report", "doctor", "bench", "reproduce",
+)  # fmt: skip
 HEAVY = ("jax", "mujoco", "flax", "orbax", "h5py", "matplotlib", "optax", "dm_control", "numpy")
 PROBE = f"""
 import sys

@@ -136,7 +136,7 @@ def test_a_recording_is_replayed_beside_a_policy_from_its_own_starts(there: Path
     recorded = load(there / "rollouts" / "learned.h5")
     save("mine.h5", recorded)
     assert main(("evaluate", "--policy", "mine.h5", "--log", "parquet", "--videos", "0", "--engine", "native")) == 0
-    assert "positions replayed" not in capsys.readouterr().err
+    assert "contacts from positions, 6 scenes" in capsys.readouterr().out
     folder = Path("runs/evaluate-mine")
     found = document(folder)
     assert (found["policy"], found["reference"], found["scenes"], found["steps"]) == ("mine", "expert", 6, 25)
@@ -145,6 +145,7 @@ def test_a_recording_is_replayed_beside_a_policy_from_its_own_starts(there: Path
     expert = load(folder / "rollouts" / "expert.h5")
     np.testing.assert_allclose(expert.position[:, 0], recorded.position[:, 0], atol=1e-6)
     assert "replay" in expert.provenance, "both are judged in the same way"
+    assert found["by_geometry"]
     log = load_log(folder / "contacts.parquet")
     assert np.isnan(log.impulse).all()
     assert len(log) > 0
@@ -175,6 +176,9 @@ def test_two_recordings_are_compared(there: Path, no_report, capsys):
     save("short.h5", first.take([0, 1]))
     assert main(("evaluate", "pair", "--policy", "one.h5", "--reference", "short.h5", "--videos", "0")) == 2
     assert "cannot be compared: short has 2 scenes of 26 rows" in capsys.readouterr().err
+    save("moved.h5", replace(first, position=first.position + 1))
+    assert main(("evaluate", "pair", "--policy", "one.h5", "--reference", "moved.h5", "--videos", "0")) == 2
+    assert "cannot be compared: they have other starts" in capsys.readouterr().err
     assert (Path("pair") / "evaluation.json").read_bytes() == before
     assert (Path("pair") / "contacts.csv").exists()
 

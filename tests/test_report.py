@@ -15,7 +15,9 @@ from gnn.checkpoint import Checkpoints
 from swarm_mjcf.errors import SwarmError
 from swarmnet.cli import parse
 from swarmnet.config import Demo, Evaluate, Render, Report, Simulate, Train
-from swarmnet.report import _gather, commands, write_report
+from swarmnet.report import write_report
+from swarmnet.report_commands import commands
+from swarmnet.report_facts import gather
 
 VOID = {"meta", "img", "br", "source"}
 NASTY = "<script>alert('x')</script>&"
@@ -138,6 +140,49 @@ def test_a_whole_run(tmp_path) -> None:
     assert not list(run.glob("*.partial"))
 
 
+def test_a_prediction_of_recordings(tmp_path) -> None:
+    run = tmp_path / "walks"
+    about = {
+        "preset": "best",
+        "train": TRAIN | {"model": "best"},
+        "data": {
+            "scenes": 50,
+            "import": {"command": "swarmnet import w.csv --out w.h5"},
+            "learn": {"data": "w.h5"},
+        },
+        "model": {"window": 1},
+    }
+    checkpoints = Checkpoints(run / "checkpoints")
+    checkpoints.save(300, {"step": np.zeros(())}, about)
+    checkpoints.close()
+    add_evaluation(run, collisions={}, contacts=False, data="w_holdout.h5", said=["speed <3> m/s"], seed=None)
+    document = json.loads((run / "evaluation.json").read_text())
+    for k, row in enumerate(document["prediction"].values()):
+        row |= {"ade": [0.031, 0.32 + k], "fde": [0.031, 0.61 + k], "paths": [987, 876], "displacement": [0.03, None]}
+    (run / "evaluation.json").write_text(json.dumps(document))
+    for name in ("truth", "predicted"):
+        save(run / "rollouts" / f"{name}.h5", scenes(3))
+    (run / "videos").mkdir()
+    (run / "videos" / "window-1.mp4").write_bytes(b"moving")
+    page = page_of(run)
+    for words in (
+        "judged by its prediction of 77 recorded scenes (w_holdout.h5), 5 steps of 0.5 s",
+        "After 2.5 s it is 0.61 m (swarmnet best) off on average; 1.61 m (constant velocity) and 2.61 m",
+        "Displacement after 2.5 s",
+        "The same window twice",
+        "Displacement error [m]",
+        "987",
+        "Predicted over recorded",
+        "Speed <3> m/s.",
+        "swarmnet import w.csv --out w.h5",
+        "swarmnet learn w.h5",
+        f"swarmnet evaluate {run} --data w_holdout.h5",
+    ):
+        assert words in page.text
+    for words in ("cannot steer", "bodies pass through", "In closed loop", "Worst scenes", "Still to be made"):
+        assert words not in page.text
+
+
 def test_every_figure_of_a_collision_report_has_its_row(tmp_path) -> None:
     report = {name: vars(value) for name, value in collision_report(scenes()).items()}
     add_evaluation(tmp_path, collisions={"expert": report, "swarmnet best": report})
@@ -196,10 +241,10 @@ def test_commands_parse_and_say_what_was_done(tmp_path) -> None:
     add_evaluation(run)
     save(run / "rollouts" / "expert.h5", scenes())
     save(run / "rollouts" / "learned.h5", scenes())
-    parsed = {type(config): config for config in map(_parsed, commands(_gather(run)))}
+    parsed = {type(config): config for config in map(_parsed, commands(gather(run)))}
     simulate, train = parsed[Simulate], parsed[Train]
     assert {name: getattr(simulate, name) for name in SIMULATE} == SIMULATE
-    assert simulate.out == train.data
+    assert train.data == (simulate.out,)
     assert (train.run, train.model, train.stage_steps, train.horizons) == (run, "thesis-ch5", (100, 200), (1, 5))
     assert train.noise == 0.1
     assert round(train.validation * 60) == 10
@@ -208,7 +253,7 @@ def test_commands_parse_and_say_what_was_done(tmp_path) -> None:
     assert parsed[Render].data == (run / "rollouts" / "expert.h5", run / "rollouts" / "learned.h5")
     demo = {"name": "x", "scenes": 44, "test_scenes": 5, "model": "best", "scale": 0.1, "seed": 7, "engine": "auto"}
     (run / "config.json").write_text(json.dumps(demo | {"videos": 0}))
-    parsed = {type(config): config for config in map(_parsed, commands(_gather(run)))}
+    parsed = {type(config): config for config in map(_parsed, commands(gather(run)))}
     assert {name: getattr(parsed[Demo], name) for name in demo} == demo
     assert parsed[Demo].videos == 3
     assert Train not in parsed

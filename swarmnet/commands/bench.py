@@ -1,5 +1,6 @@
 """`swarmnet bench`: prints `name.metric value` lines; what is compared is measured in the same run."""
 
+import itertools
 import math
 import re
 import tempfile
@@ -11,7 +12,6 @@ import jax
 from envs.config import SimulateConfig
 from envs.simulate import simulate_in_memory
 from gnn.config import TrainConfig
-from gnn.decode import make_predict
 from gnn.evaluate import constant_velocity, persistence, prediction_error
 from gnn.train import train
 from swarm_mjcf.build import compile_scene
@@ -20,6 +20,7 @@ from swarmnet.bench_adapters import bench_adapters
 from swarmnet.bench_engines import bench_engines
 from swarmnet.bench_experts import bench_experts
 from swarmnet.bench_throughput import bench_throughput
+from swarmnet.bench_train import bench_loop, bench_one_core
 from swarmnet.commands.train import note
 from swarmnet.config import Bench
 from swarmnet.progress import progress
@@ -135,7 +136,7 @@ def _imitation(config: Bench) -> Results:
     show("train", "seconds", time.monotonic() - begun, "s")
     show("train", "runs", config.scenes, "trajectories")
     predictors = {
-        "swarmnet best": (make_predict(model.config, model.scales, model.integrator), model.params),
+        "swarmnet best": (model.predict, model.params),
         "constant velocity": (constant_velocity(model.integrator.dt), {}),
         "persistence": (persistence, {}),
     }
@@ -147,6 +148,26 @@ def _imitation(config: Bench) -> Results:
                 reference = THESIS.get(column) if name.startswith("swarmnet") else None
                 show(name, column, value, "normalized MSE", reference)
     return Results(name="bench-imitation", rows=rows, dt=0.3, seeds=[config.seed])
+
+
+def _train(config: Bench) -> Results:
+    """The training loop of two presets, and one core against Keras."""
+    data = simulate_in_memory(SimulateConfig(preset="published", scenes=config.scenes, seed=config.seed))
+    loops = (
+        bench_loop(TrainConfig(model=model, seed=config.seed).scaled(0.1 * config.scale), data)
+        for model in ("best", "thesis-ch3")
+    )
+    rows = []
+    for rate in itertools.chain(loops, bench_one_core(config.seed)):
+        if isinstance(rate, str):
+            print(rate, flush=True)
+            continue
+        figures = (("windows/s", rate.windows_per_second, "1/s"), ("compiled share", rate.compiled_share, "1"))
+        for figure, value, unit in figures:
+            if value is not None:
+                print(f"train.{_metric(rate.case)}.{_metric(figure)} {value:.4g}", flush=True)
+                rows.append(Row(rate.case, figure, value, unit=unit))
+    return Results(name="bench-train", rows=rows, dt=0.3, seeds=[config.seed])
 
 
 def _build(config: Bench) -> Results:
@@ -175,6 +196,7 @@ _MEASURES = {
     "adapters": _adapters,
     "throughput": _throughput,
     "imitation": _imitation,
+    "train": _train,
     "rendering": _rendering,
     "build": _build,
 }

@@ -1,14 +1,15 @@
 """`swarmnet evaluate`."""
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from envs.config import SimulateConfig
 from swarm_mjcf.errors import SpecError, SwarmError
 from swarmnet.closed_loop import Stage, stage_of_recording
 from swarmnet.config import Evaluate
-from swarmnet.judge import Judgement, judge_policy, tables, training_world
+from swarmnet.figures_recorded import show_windows
+from swarmnet.judge import Judgement, judge_policy, judge_recorded, tables, training_world
 from swarmnet.policies import EXPERT, Source, find_policy, model_source
 from swarmnet.progress import progress
 from swarmnet.report import write_report
@@ -27,20 +28,40 @@ def run(config: Evaluate) -> int:
     if config.policy is None and config.run is None:
         raise SwarmError("nothing to judge: give a run folder with a trained model, or --policy")
     source = find_policy(config.policy) if config.policy is not None else model_source(config.run or Path())
-    reference = None if config.reference == NONE else find_policy(config.reference)
-    stage, reference = _stage(config, source, reference)
     folder = config.run or source.folder or Path("runs") / f"evaluate-{_slug(source.name)}"
-    judgement = judge_policy(source, reference, stage, folder, log=config.log)
+    if config.data is not None:
+        _check_alone(config)
+        judgement = judge_recorded(source, config.data, folder)
+    else:
+        reference = None if config.reference == NONE else find_policy(config.reference)
+        stage, reference = _stage(config, source, reference)
+        judgement = judge_policy(source, reference, stage, folder, log=config.log)
+    conclude(judgement, folder, videos=config.videos, json=config.json)
+    return 0
+
+
+def conclude(judgement: Judgement, folder: Path, *, videos: int, json: Path | None = None) -> None:
+    """Records a judgement in a run folder, prints it, makes videos and writes the report."""
     judgement.write(folder)
     print(tables(judgement))
-    if config.json:
-        write_results(config.json, as_results(judgement))
-    if config.videos:
-        _videos(folder, judgement, config.videos)
+    if json:
+        write_results(json, as_results(judgement))
+    if judgement.data:
+        show_windows(folder, videos)
+    elif videos:
+        _videos(folder, judgement, videos)
     if judgement.contact_log:
         print(f"contact log: {folder / judgement.contact_log}")
     print(f"report: {write_report(folder)}")
-    return 0
+
+
+def _check_alone(config: Evaluate) -> None:
+    """Raises SpecError for an option that says something of scenes, where those of a file are predicted."""
+    for field in fields(config):
+        if field.name not in ("run", "policy", "data", "videos", "json"):
+            value = getattr(config, field.name)
+            if value != field.default:
+                raise SpecError(field.name, value, "nothing beside --data: recorded scenes are predicted as they are")
 
 
 def _stage(config: Evaluate, source: Source, reference: Source | None) -> tuple[Stage, Source | None]:
@@ -98,6 +119,9 @@ def as_results(judgement: Judgement) -> Results:
         for kind in ("published_mean", "published_median", "agents_mean", "agents_median"):
             for horizon, value in zip(error.horizons, getattr(error, kind), strict=True):
                 rows.append(Row(name, f"{kind} {horizon} steps", value, unit="normalized MSE"))
+        for kind in ("ade", "fde"):
+            for horizon, value in zip(error.horizons, getattr(error, kind), strict=True):
+                rows.append(Row(name, f"{kind} {horizon} steps", value, unit="m"))
     for reports in (judgement.collisions, judgement.collective):
         for name, report in reports.items():
             for figure, estimate in report.items():
@@ -105,4 +129,6 @@ def as_results(judgement: Judgement) -> Results:
                 for end in ("low", "high"):
                     if (bound := getattr(estimate, end)) is not None:
                         rows.append(Row(name, f"{figure} {end}", bound, unit=estimate.unit))
-    return Results(name="evaluate", rows=rows, dt=judgement.dt, seeds=[judgement.seed])
+    return Results(
+        name="evaluate", rows=rows, dt=judgement.dt, seeds=[] if judgement.seed is None else [judgement.seed]
+    )

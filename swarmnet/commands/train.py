@@ -1,8 +1,14 @@
 """`swarmnet train`."""
 
+from functools import partial
+from pathlib import Path
+
 from envs.storage import load
+from gnn.budget import train_for
+from gnn.checkpoint import load_model
 from gnn.config import TrainConfig
-from gnn.train import train
+from gnn.padding import mix
+from gnn.train import split, train
 from swarm_mjcf.errors import SpecError
 from swarmnet.config import Train, part_of
 from swarmnet.progress import progress
@@ -10,21 +16,24 @@ from swarmnet.progress import progress
 
 def run(config: Train) -> int:
     """Trains, or goes on."""
-    if not 0 < config.validation < 1:
+    if not 0 < config.validation < 1:  # before files are read
         raise SpecError("validation", config.validation, "a share between 0 and 1")
-    data = load(config.data)
-    kept = max(1, round(config.validation * len(data)))
-    if kept >= len(data):
-        raise SpecError("validation", config.validation, f"a share that leaves some of {len(data)} scenes to train on")
+    parts = [split(load(path), config.validation) for path in config.data]
+    learning, validation = (mix(side) for side in zip(*parts, strict=True))
+    initial = None if config.init is None else load_model(Path(config.init) / "checkpoints")
+    how = part_of(TrainConfig, config).scaled(config.scale)
+    training = train if config.minutes is None else partial(train_for, config.minutes)
     with progress(f"train {config.model}") as update:
-        model = train(
-            part_of(TrainConfig, config).scaled(config.scale),
-            data.take(slice(kept, None)),
+        model = training(
+            how,
+            learning,
             config.run,
-            validation=data.take(slice(0, kept)),
+            validation=validation,
             progress=lambda done, total, row: update(done, total, note(row)),
+            initial=initial,
+            freeze=config.freeze,
         )
-    print(f"{config.run}: {model.about['preset']} trained for {model.about['step']} steps on {len(data) - kept} scenes")
+    print(f"{config.run}: {model.about['preset']} trained for {model.about['step']} steps on {len(learning)} scenes")
     print(f"next: swarmnet evaluate {config.run}")
     return 0
 

@@ -1,0 +1,120 @@
+"""`swarmnet probe`."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from envs.config import SimulateConfig
+from envs.experts.config import ExpertConfig
+from envs.plain import from_plain
+from envs.simulate import simulate_in_memory
+from envs.storage import load
+from envs.trajectories import AGENT, Trajectories
+from gnn.checkpoint import Model, load_model
+from gnn.contributions import along
+from gnn.force_fields import ForceField, force_field
+from gnn.laws import LawError
+from gnn.messages import edge_kinds
+from gnn.probe import linear_probe
+from gnn.separation import HORIZONS, separation
+from swarm_mjcf.errors import SpecError, SwarmError
+from swarmnet.config import Probe
+from swarmnet.figures import STYLE, svg
+from swarmnet.figures_probe import contribution_figure, force_field_figure, separation_figure
+from swarmnet.judge import training_world
+from swarmnet.results import write_whole
+
+GOAL = (0.0, 60.0)
+"""Where a lone receiver's goal is while other edges are looked at [m]: straight ahead."""
+
+
+@mpl.rc_context(STYLE)
+def run(config: Probe) -> int:
+    """Looks inside and prints; RUN gets probe.json and figures/probe-*.svg."""
+    if config.scenes < 4:
+        raise SpecError("scenes", config.scenes, "at least 4")
+    model = load_model(config.run / "checkpoints")
+    kinds = edge_kinds(model)
+    data, expert = _data(config, model)
+    if not 0 <= config.scene < len(data):
+        raise SpecError("scene", config.scene, f"from 0 to {len(data) - 1}")
+    found: dict[str, Any] = {"scenes": len(data), "dt": data.dt}
+    fields = [_known(model, kind, expert, over) for kind in kinds for over in ("position", "velocity")]
+    found["force_fields"] = [
+        {"kind": f.kind, "over": f.over, "r2": _finite(f.r2), "relative_error": _finite(f.relative_error)}
+        for f in fields
+    ]
+    for over in ("position", "velocity"):
+        _write(config.run, f"probe-{over}", force_field_figure([field for field in fields if field.over == over]))
+    for one in found["force_fields"]:
+        if one["r2"] is not None:
+            print(f"{one['kind']} over relative {one['over']}: R2 {one['r2']:.3f}, error {one['relative_error']:.1%}")
+    if expert is not None and "agent" in kinds and data.counts[2] > 1:
+        try:
+            probe = linear_probe(model, data, expert, seed=config.seed)
+            found["linear_probe"] = {k: getattr(probe, k) for k in ("r2", "shuffled", "fitted", "tested")}
+            print(f"messages between agents -> true pair force: R2 {probe.r2:.3f} (shuffled {probe.shuffled:.3f})")
+        except LawError as error:
+            print(f"no linear probe: {error}")
+    parts = along(model, data, config.scene)
+    agents = np.flatnonzero(data.mask[config.scene, 0, data.kind[config.scene] == AGENT])[:3]
+    if len(agents):
+        shown = contribution_figure(
+            parts, dt=data.dt, agents=tuple(int(a) for a in agents), first_row=model.config.window - 1
+        )
+        _write(config.run, "probe-contributions", shown)
+    if expert is not None:
+        try:
+            columns = separation(model, data, expert, walls_stay=config.walls_stay)
+            found["figure-5.1"] = {
+                name: dict(zip(map(str, column.error.horizons), column.error.published_mean, strict=True))
+                for name, column in columns.items()
+            }
+            for name, column in columns.items():
+                error = dict(zip(column.error.horizons, column.error.published_mean, strict=True))
+                said = ", ".join(f"{error[h]:.3g} at {h}" for h in HORIZONS if h in error)
+                print(f"figure 5.1 ({name}) {' + '.join(column.kinds)}: normalized error {said} steps")
+            _write(config.run, "figure-5.1", separation_figure(columns))
+        except LawError as error:
+            print(f"no figure 5.1: {error}")
+    write_whole(config.run / "probe.json", json.dumps(found, indent=1) + "\n")
+    print(f"{config.run}: probe.json, figures/probe-*.svg")
+    return 0
+
+
+def _data(config: Probe, model: Model) -> tuple[Trajectories, ExpertConfig | None]:
+    """Scenes that the model has not seen, and the law that made them where it is known."""
+    if config.data is None:
+        seen = training_world(model)
+        if config.seed == seen.seed:
+            raise SpecError("seed", config.seed, f"another seed than the training data's, {seen.seed}")
+        world = replace(seen, scenes=config.scenes, seed=config.seed)
+        return simulate_in_memory(world), world.world().expert
+    data = load(config.data)
+    data = data.take(slice(0, config.scenes))
+    if len(data) < 4:
+        raise SwarmError(f"{config.data}: holds {len(data)} scenes, a probe needs at least 4")
+    settings = data.provenance.get("simulate")
+    return data, None if settings is None else from_plain(SimulateConfig, settings).world().expert
+
+
+def _known(model: Model, kind: str, expert: ExpertConfig | None, over: str) -> ForceField:
+    """The field beside the true law, or alone where the expert has no law for this type."""
+    goal = GOAL if kind != "goal" and "goal" in edge_kinds(model) else None
+    apart = (0.0, 4.0) if kind == "agent" else (3.0, 25.0)
+    try:
+        return force_field(model, kind, expert, over=over, goal=goal, apart=apart)
+    except LawError:
+        return force_field(model, kind, None, over=over, goal=goal, apart=apart)
+
+
+def _finite(value: float) -> float | None:
+    return None if value != value else value
+
+
+def _write(run: Path, name: str, figure: Any) -> None:
+    write_whole(run / "figures" / f"{name}.svg", svg(figure))

@@ -1,0 +1,56 @@
+"""`swarmnet reproduce`."""
+
+import sys
+
+from swarmnet.config import Reproduce
+from swarmnet.reproduce.cells import claimed, records, run_cells
+from swarmnet.reproduce.experiment import PROFILES, REGISTRY, Experiment, find
+from swarmnet.reproduce.merge import merge, table
+from swarmnet.results import Results, write_results
+
+
+def run(config: Reproduce) -> int:
+    """Does what is missing, and prints, draws and writes what is there. 1 when a cell has failed."""
+    if config.name is None:
+        for name in REGISTRY:
+            print(f"{name:12} {find(name).about}")
+        return 0
+    experiment = find(config.name)
+    effort = experiment.effort(config.profile, config.out / "data", config.minutes)
+    usual = PROFILES[config.profile].seeds
+    cells = experiment.cells(config.seeds or usual, config.rows, config.columns)
+    planned = experiment.cells(sorted({*usual, *config.seeds}))
+    folder = config.out / config.profile / experiment.name
+    file = config.json or folder.parent / f"{experiment.name}.json"
+
+    def merged() -> Results:
+        command = _command(config, experiment, claimed(folder).get("minutes"))
+        results = merge(experiment, planned, folder, profile=config.profile, command=command)
+        write_results(file, results)
+        return results
+
+    def finished(title: str, record: dict) -> None:
+        found = record.get("failed") or ", ".join(f"{name}: {value}" for name, value in record["values"].items())
+        print(f"{title}: {found} ({record['wall_seconds']:.0f} s)", file=sys.stderr, flush=True)
+        merged()
+
+    if not config.merge_only:
+        outcome = run_cells(experiment, cells, effort, folder, finished=finished)
+        for cell in outcome.busy:
+            print(f"skipped, another process works on it: {cell}", file=sys.stderr)
+    results = merged()
+    print(table(results))
+    print(f"\n{file}")
+    done = [(cell, record) for cell, record in records(experiment, folder) if "values" in record]
+    if experiment.figure and done:
+        for path in experiment.figure(folder, done):
+            print(path)
+    return 1 if results.more["failed"] else 0
+
+
+def _command(config: Reproduce, experiment: Experiment, minutes: float | None) -> str:
+    """The one command that makes the whole document, whatever calls it took."""
+    words = ["swarmnet reproduce", experiment.name, "--profile", config.profile]
+    if minutes and minutes != experiment.effort(config.profile, config.out).minutes:
+        words += ["--minutes", f"{minutes:g}"]
+    return " ".join(words)

@@ -1,0 +1,145 @@
+"""Judging a model's prediction on recorded trajectories, imported or simulated: no physics, no expert."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.storage import load, save
+from envs.trajectories import AGENT, Trajectories
+from gnn.checkpoint import Model
+from gnn.evaluate import HORIZONS, PredictionError, constant_velocity, persistence, prediction_error
+from gnn.windows import Dataset, check_rows, windows
+from swarm_mjcf.errors import SwarmError
+from swarmnet.out_of_range import out_of_range
+from swarmnet.policies import PolicyError, Source
+from swarmnet.progress import progress
+
+SHOWN = 4
+"""Windows that are drawn."""
+_LOOKED = 256
+"""Scenes among which they are chosen."""
+
+
+def predictions(source: Source, truth: Trajectories, label: str = "") -> dict[str, PredictionError]:
+    """Prediction error of a model and, beside it, of constant velocity and persistence."""
+    model = source.model
+    assert model is not None
+    predictors = {
+        source.name: (model.predict, model.params),
+        "constant velocity": (constant_velocity(truth.dt), {}),
+        "persistence": (persistence, {}),
+    }
+    found = {}
+    for row, (predict, params) in predictors.items():
+        with progress(f"{label}predict, {row}") as update:
+            found[row] = prediction_error(
+                predict, params, truth, window=model.config.window, progress=lambda a, b, update=update: update(a, b)
+            )
+    return found
+
+
+def holdout_of(source: Source, data: Path) -> tuple[Trajectories, list[str]]:
+    """Trajectories to judge a model on, and what is to be said of them: out of range, or its own training data.
+
+    Raises:
+      PolicyError: the source is no trained model, or learned from other kinds of nodes.
+      SwarmError: the file cannot be read, its rows are too few or not the model's time step apart.
+    """
+    model, trajectories = source.model, load(data)
+    if model is None:
+        raise PolicyError(f"policy {source.given!r}: predicts nothing; --data needs a run folder with a trained model")
+    check_rows(trajectories, model.config.window + 1, f"a prediction of 1 step from {model.config.window}")
+    trained = model.integrator
+    if abs(trained.dt - trajectories.dt) > 1e-6 or trained.substeps != trajectories.substeps:
+        raise SwarmError(
+            f"the model was trained at dt {trained.dt:g} s with {trained.substeps} substeps, {data} has rows "
+            f"{trajectories.dt:g} s apart with {trajectories.substeps}; import the recording with --dt {trained.dt:g}"
+        )
+    _check_nodes(model, trajectories, data)
+    said = [out_of_range(model.about.get("range"), trajectories), _own(model, trajectories, data)]
+    return trajectories, [line for line in said if line]
+
+
+def _check_nodes(model: Model, trajectories: Trajectories, data: Path) -> None:
+    one, zero = trajectories.take([0]), jnp.zeros(1, jnp.int32)
+    history, _, _, graph = windows(
+        Dataset.of(one), zero, zero, window=model.config.window, horizon=1, counts=trajectories.counts
+    )
+    try:
+        jax.eval_shape(lambda p: model.predict(p, history, graph, horizon=1), model.params)
+    except Exception as error:
+        goals, obstacles, agents = trajectories.counts
+        raise PolicyError(
+            f"{data}: has up to {goals} goals, {obstacles} obstacles and {agents} agents, and the model learned from "
+            f"other kinds of nodes ({str(error).strip().splitlines()[0]})"
+        ) from error
+
+
+def _own(model: Model, trajectories: Trajectories, data: Path) -> str | None:
+    """Whether a model saw these very trajectories."""
+    trained, here = model.about["data"], trajectories.provenance
+
+    def which(about: dict) -> tuple:
+        simulated = about.get("simulate") or {}
+        return (
+            about.get("fingerprint"),
+            about.get("import", {}).get("part"),
+            simulated.get("seed"),
+            simulated.get("preset"),
+        )
+
+    known = which(here)
+    if known == which(trained) and any(value is not None for value in known):
+        return f"{data} is what the model was trained on: its error says little about anybody else"
+    return None
+
+
+def sample_windows(model: Model, trajectories: Trajectories, folder: Path) -> None:
+    """Writes rollouts/truth.h5 and rollouts/predicted.h5: up to `SHOWN` windows that do not overlap, with a horizon of
+    40 steps or what fits; those in which most agents stay, in the order of the recording."""
+    window = model.config.window
+    horizon = max((h for h in HORIZONS if window + h <= trajectories.position.shape[1]), default=1)
+    rows = window + horizon
+    agents = (trajectories.mask & (trajectories.kind == AGENT)[:, None])[:_LOOKED]
+    views = np.lib.stride_tricks.sliding_window_view(agents, rows, axis=1)[:, ::rows]  # (S, starts, V, rows)
+    staying = views.all(axis=-1).sum(axis=-1)
+    chosen = np.argsort(-staying, axis=None, kind="stable")[:SHOWN]
+    chosen = np.sort(chosen[staying.ravel()[chosen] > 0]) if staying.any() else chosen[:1]
+    scenes, starts = np.unravel_index(chosen, staying.shape)
+    parts = [
+        _rows_of(trajectories.take([int(s)]), int(start) * rows, rows) for s, start in zip(scenes, starts, strict=True)
+    ]
+    truth = replace(
+        trajectories.take(scenes),
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_ROW},
+        provenance=trajectories.provenance | {"policy": "recorded"},
+    )
+    history, _, mask, graph = windows(
+        Dataset.of(truth), jnp.arange(len(truth)), jnp.zeros(len(truth), jnp.int32),
+        window=window, horizon=horizon, counts=truth.counts,
+    )  # fmt: skip
+    future = jax.device_get(jax.jit(lambda p: model.predict(p, history, graph, horizon=horizon))(model.params))
+    there = np.concatenate([truth.mask[:, :window], np.asarray(mask)], axis=1)
+    states = np.where(there[..., None], np.concatenate([history, future], axis=1), 0).astype(np.float32)
+    predicted = replace(
+        truth,
+        position=states[..., :2],
+        velocity=states[..., 2:],
+        mask=there,
+        provenance=truth.provenance | {"policy": "prediction"},
+    )
+    save(folder / "rollouts" / "truth.h5", truth)
+    save(folder / "rollouts" / "predicted.h5", predicted)
+
+
+_PER_ROW = (
+    "position", "velocity", "mask", "agent_contact", "solid_contact", "agent_events", "solid_events", "depth",
+    "saturated",
+)  # fmt: skip
+
+
+def _rows_of(trajectories: Trajectories, first: int, rows: int) -> Trajectories:
+    return replace(trajectories, **{name: getattr(trajectories, name)[:, first : first + rows] for name in _PER_ROW})

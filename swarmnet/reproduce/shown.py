@@ -1,0 +1,120 @@
+"""Scenes as a network predicts them from their first rows alone: kept in a cell's folder, drawn from there."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from envs.storage import load, save
+from envs.trajectories import Trajectories
+from gnn.checkpoint import Model
+from gnn.windows import Dataset, check_rows, windows
+from swarmnet.figures_thesis import Shown
+from swarmnet.reproduce.experiment import Cell, Experiment
+from swarmnet.sheets import write_sheet
+
+STEPS = 40
+"""Predicted steps that are shown."""
+_ROWS = (
+    "position", "velocity", "mask", "agent_contact", "solid_contact", "agent_events", "solid_events", "depth",
+    "saturated",
+)  # fmt: skip
+
+
+def show(model: Model, truth: Trajectories, folder: Path, name: str, *, unit: float) -> Float[np.ndarray, " S"]:
+    """Keeps scenes and what the model makes of them under `name`, and returns the error of each over `STEPS` steps.
+
+    The error is the published one: MSE over all predicted steps, present nodes and 4 dimensions, divided by `unit`, the
+    mean squared one-step change of the test data (`gnn.evaluate.natural_change`).
+
+    Raises TrajectoryError when the scenes are too short.
+    """
+    truth = until(truth, model.config.window + STEPS)
+    guess = predicted(model, truth)
+    keep(folder, name, truth, guess)
+    return scene_errors(truth, guess, model.config.window) / unit
+
+
+def predicted(model: Model, truth: Trajectories) -> Trajectories:
+    """The first `window` rows of every scene, then predictions from these alone; agents that overflow are absent then.
+
+    `provenance["given"]` is the number of rows that the model was given.
+    """
+    given, rows = model.config.window, truth.position.shape[1]
+    scene, zero = jnp.arange(len(truth)), jnp.zeros(len(truth), jnp.int32)
+    history, _, _, graph = windows(
+        Dataset.of(truth), scene, zero, window=given, horizon=rows - given, counts=truth.counts
+    )
+    run = jax.jit(lambda params, history, graph: model.predict(params, history, graph, horizon=rows - given))
+    states = np.concatenate([history, run(model.params, history, graph)], axis=1)
+    sound = np.logical_and.accumulate(np.isfinite(states).all(axis=-1), axis=1)
+    mask = truth.mask & sound
+    states = np.where(mask[..., None], states, 0).astype(np.float32)
+    about = truth.provenance | {"policy": "prediction", "given": given}
+    return replace(truth, position=states[..., :2], velocity=states[..., 2:], mask=mask, provenance=about)
+
+
+def scene_errors(truth: Trajectories, guess: Trajectories, given: int) -> Float[np.ndarray, " S"]:
+    """MSE of each scene over all rows after the first `given`, present nodes and 4 dimensions; inf after overflow."""
+    off = np.concatenate([truth.position - guess.position, truth.velocity - guess.velocity], axis=-1, dtype=np.float64)
+    here = truth.mask[:, given:]
+    square = np.where(guess.mask[:, given:], np.mean(off[:, given:] ** 2, axis=-1), np.inf)
+    return np.where(here, square, 0).sum(axis=(1, 2)) / here.sum(axis=(1, 2))
+
+
+def until(trajectories: Trajectories, rows: int) -> Trajectories:
+    """The first rows of every scene. Raises TrajectoryError when there are fewer."""
+    check_rows(trajectories, rows, f"a figure of {STEPS} predicted steps")
+    return replace(trajectories, **{name: getattr(trajectories, name)[:, :rows] for name in _ROWS})
+
+
+def keep(folder: Path, name: str, truth: Trajectories, guess: Trajectories) -> None:
+    """Writes FOLDER/shown/NAME-truth.h5 and NAME-predicted.h5."""
+    save(folder / "shown" / f"{name}-truth.h5", truth)
+    save(folder / "shown" / f"{name}-predicted.h5", guess)
+
+
+def panels(folder: Path, name: str, titles: Sequence[str], *, agents: tuple[int, ...] | None = None) -> list[Shown]:
+    """A panel for each title, of the scenes that were kept under `name`, in their order."""
+    truth, guess = (load(folder / "shown" / f"{name}-{what}.h5") for what in ("truth", "predicted"))
+    first = guess.provenance["given"] - 1
+    return [
+        Shown(truth.take([scene]), guess.take([scene]), title, first=first, agents=agents)
+        for scene, title in enumerate(titles)
+    ]
+
+
+def first_of_rows(done: Sequence[tuple[Cell, dict]]) -> dict[str, tuple[Cell, dict]]:
+    """The finished cell with the least seed of every row that has one: a figure shows single networks."""
+    found: dict[str, tuple[Cell, dict]] = {}
+    for cell, record in sorted(done, key=lambda pair: pair[0].seed):
+        found.setdefault(cell.row, (cell, record))
+    return found
+
+
+def small_print(record: Mapping, *, data: str = "", seeds: Sequence[int] = ()) -> str:
+    """What a network had: demonstrations (or what `data` says), minutes, dt, seed. A smoke run says that it is one."""
+    chosen = list(seeds) or [record["seed"]]
+    words = [
+        data or f"{record['demonstrations']} demonstrations",
+        f"{record['minutes']:.3g} min of training",
+        f"dt {record['dt']:g} s",
+        ("seeds " if len(chosen) > 1 else "seed ") + ", ".join(map(str, chosen)),
+    ]
+    return ", ".join(words) + (" (smoke run)" if record["profile"] == "quick" else "")
+
+
+def write(folder: Path, name: str, figure: Figure) -> list[Path]:
+    """FOLDER/NAME.png and .pdf."""
+    return [write_sheet(folder / f"{name}{ending}", figure) for ending in (".png", ".pdf")]
+
+
+def file_name(experiment: Experiment, row: str) -> str:
+    """The experiment's name for its first row, with the row's behind for the others."""
+    first = row == experiment.rows[0]
+    return experiment.name if first else f"{experiment.name}-{row.removeprefix('swarmnet ').replace(' ', '-')}"

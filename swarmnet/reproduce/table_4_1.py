@@ -1,0 +1,58 @@
+"""Table 4.1: trained on ten agents alone, tested on five, ten and twenty."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from envs.config import SimulateConfig
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
+from swarmnet.reproduce.work import demonstrations, errors, few, trained, unseen
+
+MODELS = {
+    "swarmnet best": "best",
+    "swarmnet thesis-ch3 context": "thesis-ch3",
+    "kipf": "kipf",
+    "seq2seq": "seq2seq",
+}
+WORLDS = {"boids": "published", "helbing": "helbing"}
+TRAINED, SIZES, HORIZON = 10, (5, 10, 20), 40
+THESIS = {
+    "swarmnet best": {"boids": (0.93, 0.41, 1.69), "helbing": (0.24, 0.05, 0.32)},
+    "swarmnet thesis-ch3 context": {"boids": (0.93, 0.41, 1.69), "helbing": (0.24, 0.05, 0.32)},
+    "kipf": {"boids": (111.0, 11.7, 1e4), "helbing": (1e4, 10.6, 1e6)},
+    "seq2seq": {"boids": (None, 1.45, None), "helbing": (None, 1.50, None)},
+}
+
+
+def columns(data: str) -> tuple[str, ...]:
+    """Columns of a data set, such as `boids N=5`."""
+    return tuple(f"{data} N={size}" for size in SIZES)
+
+
+def run(cell: Cell, effort: Effort, folder: Path, progress: Update) -> dict[str, float]:
+    """Trains on ten agents; a network with one input per agent is tested on ten alone."""
+    world = SimulateConfig(preset=WORLDS[cell.data], num_agents=TRAINED)
+    model = trained(
+        MODELS[cell.row], demonstrations(world, effort, cell.seed), effort, folder, progress, seed=cell.seed
+    )
+    found = {}
+    for size, column in zip(SIZES, columns(cell.data), strict=True):
+        if cell.row != "seq2seq" or size == TRAINED:
+            found |= errors(model, unseen(replace(world, num_agents=size), few(effort, size)), (HORIZON,), (column,))
+    return found
+
+
+TABLE_4_1 = Experiment(
+    name="table-4.1",
+    about="trained on 10 agents alone, error at 40 steps for 5, 10 and 20 agents",
+    rows=tuple(MODELS),
+    data_sets=tuple(DataSet(name, columns(name)) for name in WORLDS),
+    run=run,
+    references={
+        (row, column): value
+        for row, by_data in THESIS.items()
+        for data, values in by_data.items()
+        for column, value in zip(columns(data), values, strict=True)
+        if value is not None
+    },
+    leading=("swarmnet best",),
+)
