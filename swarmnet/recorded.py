@@ -104,16 +104,17 @@ def sample_windows(model: Model, trajectories: Trajectories, folder: Path) -> No
     horizon = max((h for h in HORIZONS if window + h <= trajectories.position.shape[1]), default=1)
     rows = window + horizon
     agents = (trajectories.mask & (trajectories.kind == AGENT)[:, None])[:_LOOKED]
-    views = np.lib.stride_tricks.sliding_window_view(agents, rows, axis=1)[:, ::rows]  # (S, starts, V, rows)
+    views = np.lib.stride_tricks.sliding_window_view(agents, rows, axis=1)  # (S, starts, V, rows)
     staying = views.all(axis=-1).sum(axis=-1)
-    chosen = np.argsort(-staying, axis=None, kind="stable")[:SHOWN]
-    chosen = np.sort(chosen[staying.ravel()[chosen] > 0]) if staying.any() else chosen[:1]
-    scenes, starts = np.unravel_index(chosen, staying.shape)
-    parts = [
-        _rows_of(trajectories.take([int(s)]), int(start) * rows, rows) for s, start in zip(scenes, starts, strict=True)
-    ]
+    chosen: list[tuple[int, int]] = []
+    while len(chosen) < SHOWN and (staying.any() or not chosen):
+        scene, start = (int(i) for i in np.unravel_index(np.argmax(staying), staying.shape))
+        chosen.append((scene, start))
+        staying[scene, max(0, start - rows + 1) : start + rows] = 0
+    chosen.sort()
+    parts = [_rows_of(trajectories.take([scene]), start, rows) for scene, start in chosen]
     truth = replace(
-        trajectories.take(scenes),
+        trajectories.take([scene for scene, _ in chosen]),
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_ROW},
         provenance=trajectories.provenance | {"policy": "recorded"},
     )

@@ -518,7 +518,7 @@ def tied(scenes: int, rows: int = 20, *, seed: int = 0) -> Trajectories:
     return blank(np.stack(positions, 1), np.stack(velocities, 1), [GOAL, OBSTACLE, AGENT, AGENT, AGENT])
 
 
-@everyone
+@pytest.mark.parametrize("name", ["kipf", "kipf-decoder-conv1d-context", "lstm", "seq2seq"])
 def test_springs_between_agents_are_learned_on_the_common_path_and_kept_in_checkpoints(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -103,7 +103,7 @@ def test_a_wrong_word_is_named_and_exits_with_2(arguments: tuple[str, ...], name
     [
         (("simulate", "--scenes", "0"), "scenes: 0 was given"),
         (("simulate", "--preset", "moon"), "preset: 'moon' was given"),
-        (("train", "x.h5", "--model", "gat"), "one of thesis-ch3, thesis-ch5, best"),
+        (("train", "x.h5", "--model", "gat"), "one of thesis-ch3, thesis-ch3-blind, thesis-ch5, best"),
         (("train", "x.h5", "--stage-steps", "5", "5", "5", "5"), "multiples of chunk"),
         (("train", "x.h5", "--chunk", "0"), "chunk: 0 was given"),
     ],

@@ -609,7 +609,7 @@ def test_no_velocity_knows_the_future(seed: int, dt: float):
     np.testing.assert_array_equal(a.velocity[before], b.velocity[before])
     np.testing.assert_array_equal(a.position[before], b.position[before])
     inside = a.row * dt
-    assert (inside <= 3.9 + 1e-9).all()
+    assert (inside <= 3.9 + 1e-4 * dt).all()  # a row within 1e-4 of a step of the grid is on it
 
 
 def test_gaps_are_refused_split_or_bridged():

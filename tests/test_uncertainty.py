@@ -11,7 +11,7 @@ from learning import INTEGRATOR, blank, complete, initial, quick_compiles, rando
 
 from envs.dynamics import free_flight
 from envs.trajectories import AGENT, GOAL, OBSTACLE, Trajectories, TrajectoryError
-from gnn.calibration import Method, Study, uncertainty_study, with_noise
+from gnn.calibration import with_noise
 from gnn.checkpoint import Model
 from gnn.decode import Integrator, make_predict
 from gnn.features import Scales
@@ -28,7 +28,6 @@ from gnn.process_noise import (
     to_world,
     with_memory,
 )
-from gnn.scores import Scores
 from gnn.uncertainty import Sampler, SamplerError, make_sampler, one_step_residuals, pushed, score_futures
 from swarm_mjcf.errors import SpecError
 from swarmnet.figures import svg
@@ -297,48 +296,6 @@ def test_what_makes_no_sampler_is_refused():
 def flat(coverage: float, energy: float, nll: float, steps: int = 3) -> Scores:
     same = np.ones(steps)
     return Scores(0.5 * same, coverage * same, same, 2 * same, energy * same, nll * same, same)
-
-
-def test_a_study_says_who_covers_and_who_is_better():
-    noisy = replace(spring_sampler(), noise=constant_noise(1.0, 1.0))
-    methods = (
-        Method("dropout", noisy, flat(0.9, 2.0, 5.0)),
-        Method("ensemble", noisy, flat(0.96, 1.5, 5.5)),
-        Method("ensemble without noise", spring_sampler(), flat(0.2, 1.0, 90.0)),
-    )
-    study = Study(methods, 0.3)
-    assert [method.covers for method in methods] == [True, False, False]
-    assert study.best() == (
-        "energy score, mean over horizons: ensemble 1.500, dropout 2.000 m, so ensemble is better; "
-        "NLL, mean over horizons: dropout 5.000, ensemble 5.500 nats, so dropout is better."
-    )
-    rows = study.rows()
-    assert len(rows) == 9
-    assert rows[1] == {
-        "method": "dropout", "steps": 2, "time": 0.6, "factor": 1.0, "coverage_50": 0.5, "coverage_90": 0.9,
-        "width_50": 1.0, "width_90": 2.0, "energy": 2.0, "nll": 5.0, "rmse": 1.0,
-    }  # fmt: skip
-    assert rows[-1]["factor"] is None
-
-
-def test_the_study_runs_on_networks():
-    config = tiny("best")
-    data = noisy_springs(6, 9, 5)
-    step = Integrator(DT, 1, float("inf"), float("inf"))
-    history, graph = np.zeros((1, 1, 3, 4), np.float32), complete(np.ones((1, 3), bool), (1, 0, 2))
-
-    def made(seed: int, dropout: float = 0.0) -> Model:
-        own = replace(config, dropout=dropout)
-        return Model(own, Scales.ones(), step, initial(own, Scales.ones(), history, graph, seed), {})
-
-    study = uncertainty_study(
-        made(0, 0.2), [made(1), made(2)], data, noisy_springs(5, 9, 6), horizon=3, samples=20, starts=1, fit_steps=20
-    )
-    assert [method.name for method in study.methods] == [
-        "dropout", "dropout without noise", "ensemble", "ensemble without noise"
-    ]  # fmt: skip
-    assert len(study.rows()) == 12
-    assert all(np.isfinite(row["energy"]) and np.isfinite(row["nll"]) for row in study.rows())
 
 
 def test_passing_share_by_hand():
