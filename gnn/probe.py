@@ -12,7 +12,8 @@ from envs.trajectories import Trajectories
 from gnn.checkpoint import Model
 from gnn.force_fields import r_squared
 from gnn.laws import pair_force
-from gnn.messages import messages
+from gnn.messages import messages, swarmnet_config
+from gnn.swarmnet import heading, turned
 from gnn.windows import Dataset, check_rows, windows
 from swarm_mjcf.errors import SwarmError
 
@@ -77,7 +78,10 @@ def linear_probe(
 def message_force_pairs(
     model: Model, trajectories: Trajectories, expert: ExpertConfig, *, pairs: int, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "P F"], Float[np.ndarray, "P 2"]]:
-    """Messages between agents and the true forces [m/s^2] of the same pairs, from rows drawn at random."""
+    """Messages between agents and the true forces [m/s^2] of the same pairs, from rows drawn at random.
+
+    Forces are turned into the receiver's frame where messages are in it.
+    """
     window, rows = model.config.window, trajectories.position.shape[1]
     check_rows(trajectories, window, "the model's history")
     goals, obstacles, agents = trajectories.counts
@@ -92,7 +96,10 @@ def message_force_pairs(
     states = np.asarray(history)[:, -1, goals + obstacles :]
     shape = (*edge.shape, 4)
     receiver, sender = np.broadcast_to(states[:, :, None], shape), np.broadcast_to(states[:, None], shape)
-    return np.asarray(found)[edge], np.asarray(pair_force(expert, "agent", receiver[edge], sender[edge]))
+    force = pair_force(expert, "agent", receiver[edge], sender[edge])
+    if swarmnet_config(model).frame:
+        force = turned(heading(jnp.asarray(receiver[edge][:, 2:])), jnp.asarray(force))
+    return np.asarray(found)[edge], np.asarray(force)
 
 
 def fit_linear(

@@ -117,7 +117,7 @@ class SwarmNet(nn.Module):
             for x in (senders, places):
                 x["agent"] = jnp.take_along_axis(x["agent"], index[..., None], axis=2)
         kinds = [name for name in EDGE_TYPES if senders[name].shape[2] and (config.context or name == "agent")]
-        ahead = _heading(last[:, first:, 2:]) if config.frame else None
+        ahead = heading(last[:, first:, 2:]) if config.frame else None
         pairs = {name: self._pairs(receivers, senders[name], ahead) for name in kinds}
         messages = EdgeFunctions(config, name="edge")(pairs)
         typed = {"any": [(messages[name], masks[name]) for name in kinds]}
@@ -148,9 +148,9 @@ class SwarmNet(nn.Module):
                 for p in (own[..., :2], 0 * own[..., :2])
             )
             forces = jnp.sum(aggregate.reshape(*aggregate.shape[:-1], -1, 2), axis=-2)
-            out = _turned_back(ahead, forces) + alone - central
+            out = turned_back(ahead, forces) + alone - central
         else:
-            out = _turned_back(ahead, readout(node(jnp.concatenate([own, ahead, aggregate], axis=-1))))
+            out = turned_back(ahead, readout(node(jnp.concatenate([own, ahead, aggregate], axis=-1))))
         if config.normalise:
             out = out * scales.acceleration
         alive = graph.present if everyone else graph.present[:, first:]
@@ -164,29 +164,29 @@ class SwarmNet(nn.Module):
         if ahead is None:
             return jnp.concatenate([to, of], axis=-1)
         ahead = ahead[:, :, None]
-        apart = _turned(ahead, (of - to)[..., :2])
+        apart = turned(ahead, (of - to)[..., :2])
         # Laws change fastest at short range, where the plain difference is a small number: add it on a log scale.
         distance = jnp.sqrt(jnp.sum(apart * apart, axis=-1, keepdims=True) + 1e-8)
         speed = jnp.sum(ahead * to[..., 2:], axis=-1, keepdims=True)
-        parts = [apart, apart / distance, jnp.log(distance + 0.02), _turned(ahead, of[..., 2:]), speed]
+        parts = [apart, apart / distance, jnp.log(distance + 0.02), turned(ahead, of[..., 2:]), speed]
         return jnp.concatenate(parts, axis=-1)
 
 
-def _heading(velocity: Float[Array, "B N 2"]) -> Float[Array, "B N 2"]:
+def heading(velocity: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
     """Unit vectors along the velocity; of one who stands, the x axis."""
     square = jnp.sum(velocity * velocity, axis=-1, keepdims=True)
     moves = square > 1e-12
     return jnp.where(moves, velocity / jnp.sqrt(jnp.where(moves, square, 1)), jnp.asarray([1.0, 0.0]))
 
 
-def _turned(ahead: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*n 2"]:
+def turned(ahead: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*n 2"]:
     """Components ahead and to the left. Written out: XLA's product of many 2 x 2 matrices is slow on a CPU."""
     return jnp.stack([jnp.sum(ahead * vector, axis=-1), _cross(ahead, vector)], axis=-1)
 
 
-def _turned_back(ahead: Float[Array, "*n 2"], vector: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+def turned_back(ahead: Float[Array, "*n 2"], vector: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
     """From components ahead and to the left to the world's."""
-    return _turned(ahead * jnp.asarray([1.0, -1.0]), vector)
+    return turned(ahead * jnp.asarray([1.0, -1.0]), vector)
 
 
 def _cross(a: Float[Array, "*#n 2"], b: Float[Array, "*#n 2"]) -> Float[Array, "*n"]:
