@@ -29,7 +29,7 @@ from swarmnet.reproduce import borrow, work
 from swarmnet.reproduce.borrow import Learning, trained_once
 from swarmnet.reproduce.cells import read_record, run_cells
 from swarmnet.reproduce.experiment import Cell, Effort
-from swarmnet.reproduce.figures_3 import FIGURE_3_5, FIGURE_3_6, FIGURE_3_8, SIZES
+from swarmnet.reproduce.figures_3 import FIGURE_3_6, FIGURE_3_8, SIZES
 from swarmnet.reproduce.figures_4 import FIGURE_4_4, PAIRS
 from swarmnet.reproduce.norms import norms
 from swarmnet.reproduce.shown import keep, panels, predicted, scene_errors, show, until
@@ -267,7 +267,6 @@ def effort(tmp_path, **changes) -> Effort:
     [
         (FIGURE_3_8, "swarmnet thesis-ch3 context", ["figure-3.8"]),
         (FIGURE_4_4, "swarmnet thesis-ch3", ["figure-4.4-thesis-ch3"]),
-        (FIGURE_3_5, "swarmnet thesis-ch3 context", ["figure-3.5-thesis-ch3-context"]),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )

@@ -28,6 +28,7 @@ from gnn.process_noise import (
     to_world,
     with_memory,
 )
+from gnn.scores import Scores
 from gnn.uncertainty import Sampler, SamplerError, make_sampler, one_step_residuals, pushed, score_futures
 from swarm_mjcf.errors import SpecError
 from swarmnet.figures import svg
