@@ -87,6 +87,11 @@ class Trajectories:
         goals, obstacles, agents = (int((self.kind[0] == kind).sum()) for kind in (GOAL, OBSTACLE, AGENT))
         return goals, obstacles, agents
 
+    def rows(self, first: int, count: int) -> "Trajectories":
+        """`count` rows of every scene, from row `first` on."""
+        cut = {name: getattr(self, name)[:, first : first + count] for name in ARRAYS if name not in UNTIMED}
+        return dataclasses.replace(self, **cut)
+
     def take(self, scenes: slice | Sequence[int] | Int[np.ndarray, " n"]) -> "Trajectories":
         """Some of the scenes."""
         return dataclasses.replace(self, **{name: getattr(self, name)[scenes] for name in ARRAYS})
@@ -97,6 +102,8 @@ ARRAYS = (
     "agent_contact", "solid_contact", "agent_events", "solid_events", "depth", "saturated",
 )  # fmt: skip
 """The array fields of `Trajectories`, in the order of the file."""
+UNTIMED = ("kind", "radius", "edges")
+"""Those without an axis of rows."""
 
 
 def concatenate(parts: Sequence[Trajectories]) -> Trajectories:

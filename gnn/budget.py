@@ -38,25 +38,6 @@ class Pace:
     """One chunk of each stage with its validation [s]."""
 
 
-def planned(
-    config: TrainConfig,
-    trajectories: Trajectories,
-    minutes: float,
-    *,
-    validation: Trajectories | None = None,
-    initial: Model | None = None,
-    freeze: Sequence[str] = (),
-) -> TrainConfig:
-    """The config whose `train` takes `minutes` of wall time, compilation included, with the same other arguments.
-
-    Every stage has at least one chunk, however short the time. Touches no folder. Raises what `train` raises for data
-    and settings, and SpecError for minutes that are not above 0.
-    """
-    prepared = prepare(config, trajectories, validation=validation, initial=initial, freeze=freeze)
-    pace = measured(prepared, minutes)
-    return fitted(config, pace.chunk_seconds, 60 * minutes - pace.compile_seconds)
-
-
 def train_for(
     minutes: float,
     config: TrainConfig,

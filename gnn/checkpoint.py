@@ -39,6 +39,16 @@ class Model:
     """Plain JSON: preset, step, training settings and data it was made with."""
 
     @property
+    def trained_on(self) -> list[dict]:
+        """Provenance of all data that it has learned from: every part of a mix, and what was there before tuning."""
+
+        def parts(about: dict) -> list[dict]:
+            before = about.get("initial")
+            return [*about["data"].get("mixed", [about["data"]]), *(parts(before) if before else [])]
+
+        return parts(self.about)
+
+    @property
     def predict(self) -> Predict:
         """`predict(params, history (B, W, V, 4), graph, horizon=h) -> (B, h, V, 4)`."""
         return make_family(self.config, self.scales, self.integrator).predict

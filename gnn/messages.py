@@ -1,10 +1,8 @@
-"""What goes on inside a SwarmNet: messages, their sums, psi, and the acceleration that comes out."""
+"""What goes on inside a SwarmNet: its messages, and the acceleration that comes out."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from envs.record import Array
@@ -20,20 +18,6 @@ class NoEdgeFunctionsError(SwarmError):
     """The model is a rival of SwarmNet without typed edge functions: there is nothing to look into."""
 
 
-@dataclass(frozen=True)
-class Norms:
-    """Norms of the components' outputs where there is a present receiver (figure 4.4). In the network's own units."""
-
-    message: dict[str, Float[np.ndarray, " P"]]
-    """phi_e of every edge that is on, by type (left)."""
-    summed: Float[np.ndarray, " R"]
-    """Sum of a receiver's messages of all types, before psi (middle)."""
-    psi: Float[np.ndarray, " R"] | None
-    """Output of psi; None for a network without one."""
-    output: Float[np.ndarray, " R"]
-    """Output of the network for a receiver: its acceleration, or the change of its state (right)."""
-
-
 def swarmnet_config(model: Model) -> ModelConfig:
     """The configuration of a model that has edge functions. Raises NoEdgeFunctionsError for one that has none."""
     if not isinstance(model.config, ModelConfig):
@@ -46,25 +30,18 @@ def swarmnet_config(model: Model) -> ModelConfig:
 
 def messages(model: Model, history: Float[Array, "B W V 4"], graph: Graph) -> dict[str, Float[Array, "B N M F"]]:
     """Outputs of the edge functions by type, (receiver, sender); 0 where the edge is off."""
-    return _inside(model, history, graph)[0]
-
-
-def norms(model: Model, history: Float[Array, "B W V 4"], graph: Graph) -> Norms:
-    """Norms of what the parts of the network put out."""
-    typed, psi, output = _inside(model, history, graph)
-    agents = graph.agent.shape[-1]
-    there = np.asarray(graph.present)[:, -agents:]
-
-    def of(vectors: Array) -> np.ndarray:
-        return np.linalg.norm(np.asarray(vectors)[:, -agents:], axis=-1)[there]
-
-    summed = jnp.sum(jnp.stack([m.sum(axis=2) for m in typed.values()]), axis=0)
-    return Norms(
-        message={k: np.linalg.norm(np.asarray(m), axis=-1)[np.asarray(getattr(graph, k))] for k, m in typed.items()},
-        summed=of(summed),
-        psi=None if psi is None else of(psi),
-        output=of(output),
+    _, state = SwarmNet(swarmnet_config(model), model.scales).apply(
+        {"params": model.params},
+        jnp.asarray(history),
+        graph,
+        capture_intermediates=lambda module, _: module.name == "edge",
+        mutable=["intermediates"],
     )
+    found: Any = state["intermediates"]
+    return {
+        name: jnp.where(getattr(graph, name)[..., None], message, 0)
+        for name, message in found["edge"]["__call__"][0].items()
+    }
 
 
 def acceleration(model: Model, history: Float[Array, "B W V 4"], graph: Graph) -> Float[Array, "B N 2"]:
@@ -79,22 +56,3 @@ def edge_kinds(model: Model) -> tuple[str, ...]:
     """Edge types that the model has functions for."""
     swarmnet_config(model)
     return tuple(kind for kind in EDGE_TYPES if kind in model.params["edge"])
-
-
-def _inside(model: Model, history: Array, graph: Graph) -> tuple[dict[str, Array], Array | None, Array]:
-    """Messages by type, the output of psi, and the network's."""
-    net = SwarmNet(swarmnet_config(model), model.scales)
-    output, state = net.apply(
-        {"params": model.params},
-        jnp.asarray(history),
-        graph,
-        capture_intermediates=lambda module, _: module.name in ("edge", "psi"),
-        mutable=["intermediates"],
-    )
-    found: Any = state["intermediates"]
-    typed: dict[str, Array] = {
-        name: jnp.where(getattr(graph, name)[..., None], message, 0)
-        for name, message in found["edge"]["__call__"][0].items()
-    }
-    psi = found["psi"]["__call__"][0] if "psi" in found else None
-    return typed, psi, jnp.asarray(output)

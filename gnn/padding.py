@@ -67,11 +67,6 @@ def mix(parts: Sequence[Trajectories]) -> Trajectories:
                 )
     goals, obstacles, agents = (max(numbers) for numbers in zip(*(part.counts for part in parts), strict=True))
     rows = min(part.position.shape[1] for part in parts)
-    fitting = [_first_rows(pad(part, (goals, obstacles, agents)), rows) for part in parts]
+    fitting = [pad(part, (goals, obstacles, agents)).rows(0, rows) for part in parts]
     about = {"mixed": [{"scenes": len(part), **part.provenance} for part in parts]}
     return replace(concatenate(fitting), provenance=about)
-
-
-def _first_rows(trajectories: Trajectories, rows: int) -> Trajectories:
-    timed = [name for name in ARRAYS if name not in ("kind", "radius", "edges")]
-    return replace(trajectories, **{name: getattr(trajectories, name)[:, :rows] for name in timed})

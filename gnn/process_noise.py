@@ -23,6 +23,7 @@ from gnn.decode import network, network_init
 from gnn.family import Params
 from gnn.features import Scales
 from gnn.graph import Graph
+from gnn.swarmnet import heading, turned, turned_back
 from swarm_mjcf.errors import SwarmError
 
 SPREAD = ModelConfig(
@@ -92,22 +93,12 @@ def acceleration(
 
 def along_across(velocity: Float[Array, "*n 2"], vector: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
     """Components of vectors along the velocities and to their left; the world's own for one who stands."""
-    # Written out: XLA's product of many 2 x 2 matrices is slow on a CPU.
-    ahead = _heading(velocity)
-    left = ahead[..., 0] * vector[..., 1] - ahead[..., 1] * vector[..., 0]
-    return jnp.stack([jnp.sum(ahead * vector, axis=-1), left], axis=-1)
+    return turned(heading(velocity), vector)
 
 
 def to_world(velocity: Float[Array, "*n 2"], parts: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
     """Back from components along and across the velocities to the world's."""
-    ahead = _heading(velocity)
-    left = jnp.stack([-ahead[..., 1], ahead[..., 0]], axis=-1)
-    return parts[..., :1] * ahead + parts[..., 1:] * left
-
-
-def _heading(velocity: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-    speed = jnp.linalg.norm(velocity, axis=-1, keepdims=True)
-    return jnp.where(speed > 1e-6, velocity / jnp.maximum(speed, 1e-6), jnp.asarray([1.0, 0.0], velocity.dtype))
+    return turned_back(heading(velocity), parts)
 
 
 def fit_noise(

@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from envs.trajectories import AGENT, Trajectories, concatenate
 from gnn.contributions import NOTHING
 from gnn.force_fields import ForceField
-from gnn.messages import Norms
 from gnn.separation import HORIZONS, Column
-from swarmnet.figures import BASELINES, EXPERT, NARROW, STYLE, WIDE, blank_figure, paths_over_paths
+from swarmnet.figures import NARROW, STYLE, WIDE, blank_figure, paths_over_paths
 
 KINDS = {"goal": "#009E73", "obstacle": "#D55E00", "agent": "#0072B2", NOTHING: "#8a9099"}
 """Colours of edge types; grey is what is left without any edge."""
@@ -130,32 +129,6 @@ def _felt(trajectories: Trajectories, kinds: tuple[str, ...]) -> Trajectories:
     """Nodes whose edges are off are left out of the drawing."""
     felt = np.array([name in kinds for name in ("goal", "obstacle")] + [True])[trajectories.kind]
     return replace(trajectories, mask=trajectories.mask & (felt | (trajectories.kind == AGENT))[:, None])
-
-
-def norm_figure(rows: dict[str, Norms]) -> Figure:
-    """Figure 4.4: distributions of norms of phi_e, of the sum of messages, and of the output, one line per data set."""
-    figure = blank_figure(WIDE, 3.4)
-    panels = figure.subplots(1, 3)
-    styles = [(EXPERT, "-"), ("#0072B2", "-"), *BASELINES, ("#E69F00", "-"), ("#56B4E9", "--"), ("#8a9099", ":")]
-    shown = (
-        ("output of φₑ", lambda n: np.concatenate(list(n.message.values()))),
-        ("sum of messages, before ψ", lambda n: n.summed),
-        ("output of φᵥ", lambda n: n.output),
-    )
-    for ax, (title, of) in zip(panels, shown, strict=True):
-        values = {name: of(norms) for name, norms in rows.items()}
-        everything = np.concatenate(list(values.values()))
-        edges = np.linspace(0, float(np.quantile(everything, 0.995)) or 1.0, 61)
-        for number, (name, value) in enumerate(values.items()):
-            color, line = styles[number % len(styles)]
-            density, _ = np.histogram(value, edges, density=True)
-            label = name if ax is panels[0] else f"_{name}"
-            ax.stairs(density, edges, color=color, linestyle=line, linewidth=1.6, label=label, gid=name)
-        ax.set(title=title, xlabel="norm", yticks=[], xlim=(0, edges[-1]))
-        ax.set_ylim(bottom=0)
-    panels[0].set_ylabel("density")
-    figure.legend(loc="outside right upper")
-    return figure
 
 
 @mpl.rc_context(STYLE)

@@ -109,14 +109,17 @@ def _plain(reports: dict[str, dict[str, Estimate]]) -> dict:
 
 
 def training_world(model: Model) -> SimulateConfig:
-    """The settings of the data a model was trained on. Raises SwarmError if it was trained on something else."""
-    settings = model.about["data"].get("simulate")
-    if settings is None:
+    """The settings of the data a model was trained on; of several worlds, the first of those with the most agents.
+
+    Raises SwarmError if it was trained on something else.
+    """
+    worlds = [from_plain(SimulateConfig, about["simulate"]) for about in model.trained_on if "simulate" in about]
+    if not worlds:
         raise SwarmError(
             "the model was not trained on simulated data: judge its prediction on recorded trajectories that it has "
             "not seen (--data HOLDOUT.h5), or name a world to let it steer in (--preset)"
         )
-    return from_plain(SimulateConfig, settings)
+    return max(worlds, key=lambda world: world.num_agents)
 
 
 def judge(model: Model, config: SimulateConfig, folder: Path, *, name: str, label: str = "") -> Judgement:
@@ -260,9 +263,9 @@ def _record(folder: Path, reference: Trajectories | None, acted: Trajectories | 
 
 
 def _check_model(model: Model, stage: Stage) -> None:
-    trained, scene = model.about["data"].get("simulate", {}), stage.world.scene
-    here = stage.simulate
-    if here and stage.starts is None and (trained.get("seed"), trained.get("preset")) == (here.seed, here.preset):
+    here, scene = stage.simulate, stage.world.scene
+    seen = [(part.get("simulate", {}).get("seed"), part.get("simulate", {}).get("preset")) for part in model.trained_on]
+    if here and stage.starts is None and (here.seed, here.preset) in seen:
         raise SwarmError(f"seed {stage.seed} is the training data's own; unseen scenes need another seed")
     if (scene.dt, scene.substeps) != (model.integrator.dt, model.integrator.substeps):
         raise SwarmError(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.storage import load, save
-from envs.trajectories import AGENT, Trajectories
+from envs.trajectories import AGENT, Trajectories, concatenate
 from gnn.checkpoint import Model
 from gnn.evaluate import HORIZONS, PredictionError, constant_velocity, persistence, prediction_error
 from gnn.windows import Dataset, check_rows, windows
@@ -80,7 +80,6 @@ def _check_nodes(model: Model, trajectories: Trajectories, data: Path) -> None:
 
 def _own(model: Model, trajectories: Trajectories, data: Path) -> str | None:
     """Whether a model saw these very trajectories."""
-    trained, here = model.about["data"], trajectories.provenance
 
     def which(about: dict) -> tuple:
         simulated = about.get("simulate") or {}
@@ -91,8 +90,8 @@ def _own(model: Model, trajectories: Trajectories, data: Path) -> str | None:
             simulated.get("preset"),
         )
 
-    known = which(here)
-    if known == which(trained) and any(value is not None for value in known):
+    known = which(trajectories.provenance)
+    if any(value is not None for value in known) and known in map(which, model.trained_on):
         return f"{data} is what the model was trained on: its error says little about anybody else"
     return None
 
@@ -112,10 +111,8 @@ def sample_windows(model: Model, trajectories: Trajectories, folder: Path) -> No
         chosen.append((scene, start))
         staying[scene, max(0, start - rows + 1) : start + rows] = 0
     chosen.sort()
-    parts = [_rows_of(trajectories.take([scene]), start, rows) for scene, start in chosen]
     truth = replace(
-        trajectories.take([scene for scene, _ in chosen]),
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_ROW},
+        concatenate([trajectories.take([scene]).rows(start, rows) for scene, start in chosen]),
         provenance=trajectories.provenance | {"policy": "recorded"},
     )
     history, _, mask, graph = windows(
@@ -134,13 +131,3 @@ def sample_windows(model: Model, trajectories: Trajectories, folder: Path) -> No
     )
     save(folder / "rollouts" / "truth.h5", truth)
     save(folder / "rollouts" / "predicted.h5", predicted)
-
-
-_PER_ROW = (
-    "position", "velocity", "mask", "agent_contact", "solid_contact", "agent_events", "solid_events", "depth",
-    "saturated",
-)  # fmt: skip
-
-
-def _rows_of(trajectories: Trajectories, first: int, rows: int) -> Trajectories:
-    return replace(trajectories, **{name: getattr(trajectories, name)[:, first : first + rows] for name in _PER_ROW})

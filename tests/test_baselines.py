@@ -522,7 +522,10 @@ def tied(scenes: int, rows: int = 20, *, seed: int = 0) -> Trajectories:
 def test_springs_between_agents_are_learned_on_the_common_path_and_kept_in_checkpoints(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """In 400 steps below a third of persistence on unseen scenes; what was saved predicts what was trained."""
+    """In 400 steps far below persistence on unseen scenes; what was saved predicts what was trained.
+
+    Graph networks share one law among pairs, a model of the joint state has to learn it for every slot.
+    """
     monkeypatch.setitem(PRESETS, name, tiny(name, hidden=24))
     config = TrainConfig(model=name, horizons=(1, 3), stage_steps=(300, 100), chunk=100, batch=32, learning_rate=1e-2)
     trained = train(config, tied(64), tmp_path)
@@ -534,6 +537,6 @@ def test_springs_between_agents_are_learned_on_the_common_path_and_kept_in_check
     unseen, window = tied(8, seed=1), found.config.window
     error = prediction_error(found.predict, found.params, unseen, window=window, horizons=(3,))
     nothing = prediction_error(persistence, {}, unseen, window=window, horizons=(3,))
-    assert error.agents_mean[0] < 0.3 * nothing.agents_mean[0]
+    assert error.agents_mean[0] < (0.3 if name in ("lstm", "seq2seq") else 0.1) * nothing.agents_mean[0]
     again = prediction_error(trained.predict, trained.params, unseen, window=window, horizons=(3,))
     assert again.agents_mean == error.agents_mean

@@ -9,7 +9,7 @@ from helpers import assert_same
 from learning import quick_training, spring
 
 import gnn.budget
-from gnn.budget import Pace, fitted, measured, planned, train_for
+from gnn.budget import Pace, fitted, measured, train_for
 from gnn.checkpoint import CheckpointError
 from gnn.config import TrainConfig
 from gnn.train import prepare, train
@@ -72,14 +72,6 @@ def test_compiling_is_told_from_running(monkeypatch):
     assert measured(prepared, 10.0) == Pace(2.0 + 7.0 + 7.0, (1.5, 3.5))
     with pytest.raises(SpecError, match="minutes"):
         measured(prepared, 0.0)
-
-
-def test_a_plan_has_the_shape_of_the_curriculum_and_trains(tmp_path: Path):
-    config = replace(CONFIG, horizons=(1,), stage_steps=(4,))
-    found = planned(config, spring(), 0.02)
-    assert replace(found, stage_steps=config.stage_steps) == config
-    assert found.steps % config.chunk == 0
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_interrupted_run_keeps_its_plan(tmp_path: Path, monkeypatch):

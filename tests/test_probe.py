@@ -16,11 +16,11 @@ from gnn.decode import network
 from gnn.force_fields import ForceField, effect, force_field, r_squared
 from gnn.graph import EDGE_TYPES
 from gnn.laws import LawError, pair_force, same_rules
-from gnn.messages import NoEdgeFunctionsError, acceleration, edge_kinds, messages, norms, swarmnet_config
+from gnn.messages import NoEdgeFunctionsError, acceleration, edge_kinds, messages, swarmnet_config
 from gnn.probe import fit_linear, linear_probe
 from swarm_mjcf.errors import SpecError
 from swarmnet.figures import svg
-from swarmnet.figures_probe import contribution_figure, force_field_figure, norm_figure, png
+from swarmnet.figures_probe import contribution_figure, force_field_figure, png
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -75,22 +75,6 @@ def test_messages_are_the_edge_functions_and_nothing_where_an_edge_is_off():
         on = i != j and present[b, 2 + i] and present[b, 2 + j]
         np.testing.assert_allclose(found["agent"][b, i, j], apart if on else 0, atol=1e-5)
     assert set(found) == set(EDGE_TYPES)
-
-
-@pytest.mark.parametrize("name", ["thesis-ch3", "best"])
-def test_norms_are_of_what_the_parts_put_out(name: str):
-    model = random_model(name)
-    history, present, graph = random_swarm(2, COUNTS, window=model.config.window, absent=0.2)
-    found, typed = norms(model, history, graph), messages(model, history, graph)
-    out = np.asarray(network(swarmnet_config(model), model.scales)(model.params, history, graph))[:, -3:]
-    there = present[:, 2:]
-    np.testing.assert_allclose(found.output, np.linalg.norm(out, axis=-1)[there], rtol=1e-5)
-    total = sum(np.asarray(m).sum(axis=2) for m in typed.values())
-    np.testing.assert_allclose(found.summed, np.linalg.norm(total, axis=-1)[there], rtol=1e-5)
-    assert {k: len(v) for k, v in found.message.items()} == {k: int(np.sum(getattr(graph, k))) for k in EDGE_TYPES}
-    assert (found.psi is None) == (name == "best")
-    assert found.psi is None or len(found.psi) == there.sum()
-    assert len(norm_figure({"(3, 1)": found, "(5, 2)": found}).axes) == 3
 
 
 def test_the_acceleration_of_a_state_change_is_that_of_the_velocity():

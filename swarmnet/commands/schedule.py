@@ -14,21 +14,12 @@ from gnn.schedule import beginnings, parse_schedule, run_schedule, schedule_name
 from swarmnet.commands.train import note
 from swarmnet.config import Schedule, part_of
 from swarmnet.progress import progress
+from swarmnet.reproduce.table_4_3 import HORIZON, SIZES, THESIS
 from swarmnet.results import Results, Row, write_results
 
 HORIZONS = (5, 40)
 TEST_SEED = 1_000_000
 """Added to the seed of the training data."""
-TABLE_4_3_SIZES = (3, 5, 7, 10, 20)
-TABLE_4_3 = {
-    "5": (0.58, 0.14, 0.48, 1.66, 9.6),
-    "10": (1.96, 0.93, 0.5, 0.41, 1.69),
-    "20": (3.01, 1.78, 1.31, 0.86, 0.64),
-    "5->10": (9.04, 1.5, 0.42, 0.29, 1.68),
-    "5->5-10": (0.69, 0.13, 0.33, 0.28, 1.74),
-    "10->20": (13.1, 6.21, 3.41, 1.36, 0.62),
-}
-"""Table 4.3: the thesis's error by size, Boids, 40 steps."""
 
 
 def run(config: Schedule) -> int:
@@ -87,8 +78,8 @@ def errors(name: str, model: Model, size: int, test: Trajectories, *, boids: boo
             continue
         found = prediction_error(model.predict, model.params, test, window=window, horizons=(horizon,))
         reference = None
-        if boids and horizon == 40 and name in TABLE_4_3 and size in TABLE_4_3_SIZES:
-            reference = TABLE_4_3[name][TABLE_4_3_SIZES.index(size)]
+        if boids and horizon == HORIZON and name in THESIS and size in SIZES:
+            reference = THESIS[name][SIZES.index(size)]
         column = f"N={size} {horizon} steps"
         rows.append(Row(name, column, found.published_mean[0], reference=reference, unit="normalized MSE"))
     return rows

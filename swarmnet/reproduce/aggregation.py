@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from envs.config import SimulateConfig
-from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
 from swarmnet.reproduce.work import demonstrations, errors, few, trained, unseen
 
 MODELS = {"all": "best-all", "sum": "best-sum", "mean": "best-mean", "max": "best-max"}

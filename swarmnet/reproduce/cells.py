@@ -12,8 +12,8 @@ from pathlib import Path
 
 from envs.trajectories import versions
 from swarm_mjcf.errors import SwarmError
-from swarmnet.progress import progress
-from swarmnet.reproduce.experiment import Cell, Effort, Experiment, Update
+from swarmnet.progress import Update, progress
+from swarmnet.reproduce.experiment import Cell, Effort, Experiment
 from swarmnet.reproduce.lock import Busy, locked
 from swarmnet.reproduce.work import spent
 from swarmnet.results import commit, hardware, write_whole

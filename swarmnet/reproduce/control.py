@@ -6,7 +6,8 @@ The thesis says that the training error then "is never able to be brought down b
 from pathlib import Path
 
 from envs.config import SimulateConfig
-from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
 from swarmnet.reproduce.work import demonstrations, errors, trained, unseen
 
 MODELS = {"": "thesis-ch3", " best": "best"}

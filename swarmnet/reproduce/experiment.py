@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from swarm_mjcf.errors import SpecError
+from swarmnet.progress import Update
 
 REGISTRY: dict[str, str] = {
     "table-3.1": "swarmnet.reproduce.table_3_1:TABLE_3_1",
@@ -90,8 +91,6 @@ PROFILES = {
     "full": Profile(seeds=(0, 1, 2), demonstrations=50_000, test_scenes=500, minutes=60.0),
 }
 
-Update = Callable[..., None]
-"""`update(done, total, note="")`, as `swarmnet.progress.Update`, which cannot be checked at run time."""
 Run = Callable[[Cell, Effort, Path, Update], dict[str, float]]
 """`run(cell, effort, folder, progress) -> {column: value}`: does the cell in its folder, or goes on with it. What it
 leaves in the folder it finds there again after an interruption; `swarmnet.reproduce.work` has the parts."""

@@ -1,6 +1,5 @@
 """Figure 3.9: sampled futures of noisy Boids by dropout and by an ensemble, and how honest their bands are."""
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +17,9 @@ from gnn.uncertainty import Sampler, make_sampler, score_futures
 from gnn.windows import Dataset, windows
 from swarmnet.figures import STYLE
 from swarmnet.figures_uncertainty import figure_3_9, scores_by_horizon
-from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
-from swarmnet.reproduce.shown import first_of_rows, write
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
+from swarmnet.reproduce.shown import gathered, write
 from swarmnet.reproduce.work import demonstrations, recordings, trained, unseen
 
 WORLD = SimulateConfig(preset="published", perception_noise=1.0, actuation_noise=0.5)
@@ -78,14 +78,7 @@ def _draw(folder: Path, sampler: Sampler, test: Trajectories, scores: dict[str, 
 
 def draw(folder: Path, done: Sequence[tuple[Cell, dict]]) -> list[Path]:
     """Both figures of each method's first seed."""
-    files = []
-    for row, (cell, _) in first_of_rows(done).items():
-        for name in FIGURES:
-            for ending in (".png", ".pdf"):
-                path = folder / f"figure-3.9-{row.replace(' ', '-')}-{name}{ending}"
-                shutil.copyfile(cell.path(folder) / f"{name}{ending}", path)
-                files.append(path)
-    return files
+    return gathered(folder, done, {name: f"figure-3.9-{{row}}-{name}" for name in FIGURES})
 
 
 FIGURE_3_9 = Experiment(

@@ -4,7 +4,6 @@ Trained as the thesis says, on 1..5 agents with and without an obstacle. Column 
 (c) goal and agent, (d) goal and obstacle, (e) agent, (f) obstacle and agent; the thesis calls (e) and (f) failures.
 """
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +15,9 @@ from envs.experts.config import BoidsConfig
 from gnn.separation import COLUMNS, HORIZONS, separation
 from swarmnet.figures import STYLE
 from swarmnet.figures_probe import separation_figure
-from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
-from swarmnet.reproduce.shown import file_name, first_of_rows, write
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
+from swarmnet.reproduce.shown import gathered, write
 from swarmnet.reproduce.work import demonstrations, few, trained, unseen
 
 MODELS = {
@@ -60,13 +60,7 @@ def run(cell: Cell, effort: Effort, folder: Path, progress: Update) -> dict[str,
 
 def draw(folder: Path, done: Sequence[tuple[Cell, dict]]) -> list[Path]:
     """The sheet of each row's first seed."""
-    files = []
-    for row, (cell, _) in first_of_rows(done).items():
-        for ending in (".png", ".pdf"):
-            path = folder / f"{file_name(FIGURE_5_1, row)}{ending}"
-            shutil.copyfile(cell.path(folder) / f"{SHOWN}{ending}", path)
-            files.append(path)
-    return files
+    return gathered(folder, done, {SHOWN: "figure-5.1-{row}"})
 
 
 FIGURE_5_1 = Experiment(

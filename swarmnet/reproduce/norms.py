@@ -4,14 +4,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from envs.record import Array
 from envs.trajectories import Trajectories
 from gnn.checkpoint import Model
-from gnn.config import ModelConfig
-from gnn.graph import Graph
-from gnn.swarmnet import SwarmNet
+from gnn.decode import network
+from gnn.messages import messages, swarmnet_config
 from gnn.windows import Dataset, windows
-from swarm_mjcf.errors import SpecError
 
 PARTS = ("message", "joined", "output")
 """Outputs of the edge functions, one per edge; messages joined and the readout, one of each per agent."""
@@ -24,28 +21,17 @@ def norms(model: Model, trajectories: Trajectories, *, count: int = 200, seed: i
     their maximum, by `max` alone). The output is a change of the state with preset thesis-ch3 (eq. 3.3), else an
     acceleration [m/s^2].
 
-    Raises SpecError for a model that is no SwarmNet.
+    Raises NoEdgeFunctionsError for a model that is no SwarmNet.
     """
-    config = model.config
-    if not isinstance(config, ModelConfig):
-        raise SpecError("model", type(config).__name__, "a SwarmNet: others have no messages")
+    config = swarmnet_config(model)
     rng = np.random.default_rng(seed)
     scene = rng.integers(0, len(trajectories), count)
     start = rng.integers(0, trajectories.position.shape[1] - config.window, count)
     history, _, _, graph = windows(
         Dataset.of(trajectories), scene, start, window=config.window, horizon=1, counts=trajectories.counts
     )
-    net = SwarmNet(config, model.scales)
-
-    @jax.jit
-    def run(params: dict, history: Array, graph: Graph):
-        return net.apply(
-            {"params": params}, history, graph, mutable=["intermediates"],
-            capture_intermediates=lambda module, method: module.name == "edge",
-        )  # fmt: skip
-
-    out, inner = run(model.params, history, graph)
-    by_type = inner["intermediates"]["edge"]["__call__"][0]
+    by_type = jax.jit(lambda history, graph: messages(model, history, graph))(history, graph)
+    out = jax.jit(network(config, model.scales))(model.params, history, graph)
     message = np.concatenate([np.asarray(found, np.float64) for found in by_type.values()], axis=2)
     edge = np.concatenate([np.asarray(getattr(graph, name)) for name in by_type], axis=2)
     how = config.aggregate[0] if len(config.aggregate) == 1 else "sum"

@@ -1,5 +1,6 @@
 """Scenes as a network predicts them from their first rows alone: kept in a cell's folder, drawn from there."""
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,10 +21,6 @@ from swarmnet.sheets import write_sheet
 
 STEPS = 40
 """Predicted steps that are shown."""
-_ROWS = (
-    "position", "velocity", "mask", "agent_contact", "solid_contact", "agent_events", "solid_events", "depth",
-    "saturated",
-)  # fmt: skip
 
 
 def show(model: Model, truth: Trajectories, folder: Path, name: str, *, unit: float) -> Float[np.ndarray, " S"]:
@@ -70,7 +67,7 @@ def scene_errors(truth: Trajectories, guess: Trajectories, given: int) -> Float[
 def until(trajectories: Trajectories, rows: int) -> Trajectories:
     """The first rows of every scene. Raises TrajectoryError when there are fewer."""
     check_rows(trajectories, rows, f"a figure of {STEPS} predicted steps")
-    return replace(trajectories, **{name: getattr(trajectories, name)[:, :rows] for name in _ROWS})
+    return trajectories.rows(0, rows)
 
 
 def keep(folder: Path, name: str, truth: Trajectories, guess: Trajectories) -> None:
@@ -89,9 +86,9 @@ def panels(folder: Path, name: str, titles: Sequence[str], *, agents: tuple[int,
     ]
 
 
-def first_of_rows(done: Sequence[tuple[Cell, dict]]) -> dict[str, tuple[Cell, dict]]:
+def first_of_rows[R: Mapping](done: Sequence[tuple[Cell, R]]) -> dict[str, tuple[Cell, R]]:
     """The finished cell with the least seed of every row that has one: a figure shows single networks."""
-    found: dict[str, tuple[Cell, dict]] = {}
+    found: dict[str, tuple[Cell, R]] = {}
     for cell, record in sorted(done, key=lambda pair: pair[0].seed):
         found.setdefault(cell.row, (cell, record))
     return found
@@ -112,6 +109,19 @@ def small_print(record: Mapping, *, data: str = "", seeds: Sequence[int] = ()) -
 def write(folder: Path, name: str, figure: Figure) -> list[Path]:
     """FOLDER/NAME.png and .pdf."""
     return [write_sheet(folder / f"{name}{ending}", figure) for ending in (".png", ".pdf")]
+
+
+def gathered(folder: Path, done: Sequence[tuple[Cell, Mapping]], pictures: Mapping[str, str]) -> list[Path]:
+    """Copies the pictures that the first cell of each row drew into `folder`; `pictures`: name there -> name with
+    `{row}`."""
+    files = []
+    for row, (cell, _) in first_of_rows(done).items():
+        for kept, name in pictures.items():
+            for ending in (".png", ".pdf"):
+                path = folder / f"{name.format(row=row.removeprefix('swarmnet ').replace(' ', '-'))}{ending}"
+                shutil.copyfile(cell.path(folder) / f"{kept}{ending}", path)
+                files.append(path)
+    return files
 
 
 def file_name(experiment: Experiment, row: str) -> str:

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from envs.config import SimulateConfig
 from gnn.evaluate import constant_velocity, persistence
-from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
 from swarmnet.reproduce.work import demonstrations, errors, published_mean, trained, unseen
 
 MODELS = {

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from envs.config import SimulateConfig
-from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
 from swarmnet.reproduce.work import demonstrations, errors, trained, unseen
 
 MODELS = {

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from envs.config import SimulateConfig
 from gnn.checkpoint import Model
-from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment, Update
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
 from swarmnet.reproduce.lock import locked
 from swarmnet.reproduce.work import demonstrations, errors, few, trained, unseen
 

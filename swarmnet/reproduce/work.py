@@ -17,7 +17,8 @@ from gnn.metrics import read_metrics
 from gnn.padding import mix
 from gnn.train import split
 from swarmnet.commands.train import note
-from swarmnet.reproduce.experiment import Effort, Update
+from swarmnet.progress import Update
+from swarmnet.reproduce.experiment import Effort
 from swarmnet.reproduce.lock import locked
 
 VALIDATION = 0.05
