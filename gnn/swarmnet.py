@@ -5,6 +5,7 @@ Parameters are a nested dict whose paths name the parts: `edge/goal`, `edge/obst
 """
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import flax.linen as nn
 import jax
@@ -17,8 +18,30 @@ from gnn.features import Scales
 from gnn.graph import EDGE_TYPES, Graph
 
 
+class Dense(nn.Module):
+    """A linear layer of several inputs side by side, each multiplied before it is broadcast to the others.
+
+    Of a pair of nodes, that is one product per node instead of one per pair.
+    """
+
+    width: int
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self, *inputs: Float[Array, "*_ inputs"]) -> Float[Array, "*n outputs"]:
+        sizes = [x.shape[-1] for x in inputs]
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), self.width))
+        bounds = list(accumulate(sizes))[:-1]
+        products = [x @ part for x, part in zip(inputs, jnp.split(kernel, bounds), strict=True)]
+        total = sum(products[1:], products[0])
+        return total + self.param("bias", nn.initializers.zeros, (self.width,)) if self.use_bias else total
+
+
 class MLP(nn.Module):
-    """ReLU layers, then a linear one `out` wide (none for `out=0`: the last hidden layer is the output)."""
+    """ReLU layers, then a linear one `out` wide (none for `out=0`: the last hidden layer is the output).
+
+    Of several inputs, which are broadcast to each other and stand side by side.
+    """
 
     hidden: Sequence[int]
     out: int
@@ -27,15 +50,17 @@ class MLP(nn.Module):
     """Of hidden neurons; only where the caller gives a random stream of that name."""
 
     @nn.compact
-    def __call__(self, x: Float[Array, "*n inputs"]) -> Float[Array, "*n outputs"]:
-        given = x
+    def __call__(self, *inputs: Float[Array, "*_ inputs"]) -> Float[Array, "*n outputs"]:
+        x = inputs
         for depth, width in enumerate(self.hidden):
-            x = nn.relu(nn.Dense(width, name=f"layer{depth}")(x))
+            y = nn.relu(Dense(width, name=f"layer{depth}")(*x))
             if self.dropout:
-                x = nn.Dropout(self.dropout, deterministic=not self.has_rng("dropout"))(x)
+                y = nn.Dropout(self.dropout, deterministic=not self.has_rng("dropout"))(y)
+            x = (y,)
         if self.out:
-            x = nn.Dense(self.out, name=f"layer{len(self.hidden)}")(x)
-        return x + nn.Dense(x.shape[-1], use_bias=False, name="skip")(given) if self.skip else x
+            x = (Dense(self.out, name=f"layer{len(self.hidden)}")(*x),)
+        (y,) = x
+        return y + Dense(y.shape[-1], use_bias=False, name="skip")(*inputs) if self.skip else y
 
 
 class EdgeFunctions(nn.Module):
@@ -44,11 +69,11 @@ class EdgeFunctions(nn.Module):
     config: ModelConfig
 
     @nn.compact
-    def __call__(self, pairs: dict[str, Array]) -> dict[str, Array]:
+    def __call__(self, pairs: dict[str, Sequence[Array]]) -> dict[str, Array]:
         config = self.config
         return {
-            name: MLP(config.edge_hidden, config.message, config.skip, config.dropout, name=name)(x)
-            for name, x in pairs.items()
+            name: MLP(config.edge_hidden, config.message, config.skip, config.dropout, name=name)(*inputs)
+            for name, inputs in pairs.items()
         }
 
 
@@ -82,7 +107,7 @@ class Convolutions(nn.Module):
     def __call__(self, history: Float[Array, "B V W F"]) -> Float[Array, "B V C"]:
         for depth, width in enumerate(self.filters):
             three = jnp.concatenate([history[:, :, :-2], history[:, :, 1:-1], history[:, :, 2:]], axis=-1)
-            history = nn.relu(nn.Dense(width, name=f"layer{depth}")(three))
+            history = nn.relu(Dense(width, name=f"layer{depth}")(three))
         return history[:, :, 0]
 
 
@@ -158,18 +183,18 @@ class SwarmNet(nn.Module):
 
     def _pairs(
         self, receivers: Float[Array, "B N F"], senders: Float[Array, "B #N M F"], ahead: Float[Array, "B N 2"] | None
-    ) -> Float[Array, "B N M G"]:
+    ) -> Sequence[Float[Array, "B _ _ _"]]:
+        if ahead is None:
+            return receivers[:, :, None], senders
         shape = (*receivers.shape[:2], *senders.shape[2:])
         to, of = jnp.broadcast_to(receivers[:, :, None], shape), jnp.broadcast_to(senders, shape)
-        if ahead is None:
-            return jnp.concatenate([to, of], axis=-1)
         ahead = ahead[:, :, None]
         apart = turned(ahead, (of - to)[..., :2])
         # Laws change fastest at short range, where the plain difference is a small number: add it on a log scale.
         distance = jnp.sqrt(jnp.sum(apart * apart, axis=-1, keepdims=True) + 1e-8)
         speed = jnp.sum(ahead * to[..., 2:], axis=-1, keepdims=True)
         parts = [apart, apart / distance, jnp.log(distance + 0.02), turned(ahead, of[..., 2:]), speed]
-        return jnp.concatenate(parts, axis=-1)
+        return (jnp.concatenate(parts, axis=-1),)
 
 
 def heading(velocity: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:

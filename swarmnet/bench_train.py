@@ -7,7 +7,6 @@ one predicted step) on the same windows, each in a process of its own that is bo
 import importlib
 import importlib.util
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -28,6 +27,14 @@ from gnn.train import prepare, train_prepared
 WINDOW, BATCH, WIDTH = 5, 128, 64
 SCENES, SECONDS = 200, 10.0
 """Of the comparison: scenes to draw windows from, and how long each side trains."""
+
+BOUND = """
+import os, runpy
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+runpy.run_module("swarmnet.bench_train", run_name="__main__")
+"""
+"""Runs one side of the comparison. Bound before anything is imported, so that no library sees more than one core."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +77,9 @@ def bench_one_core(seed: int = 0) -> Iterator[TrainRate | str]:
         if case == "keras" and importlib.util.find_spec("keras") is None:
             yield "keras is not installed: `pip install tensorflow-cpu` to compare with it"
             return
-        command = [sys.executable, "-m", "swarmnet.bench_train", case, str(seed)]
-        # Before the process starts, so that no library sees more than one core.
-        found = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, preexec_fn=_bind)
+        command = [sys.executable, "-c", BOUND, case, str(seed)]
+        found = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         yield TrainRate(f"{case}, one core", float(json.loads(found.stdout.splitlines()[-1])))
-
-
-def _bind() -> None:
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def demonstrations(seed: int) -> Trajectories:

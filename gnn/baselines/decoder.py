@@ -34,9 +34,7 @@ class Messages(nn.Module):
     ) -> Float[Array, "B N H"]:
         total = jnp.zeros((*receivers.shape[:2], self.hidden))
         for name, sources in senders.items():
-            shape = (*receivers.shape[:2], *sources.shape[1:])
-            pairs = [jnp.broadcast_to(x, shape) for x in (receivers[:, :, None], sources[:, None])]
-            messages = MLP((self.hidden, self.hidden), 0, name=name)(jnp.concatenate(pairs, axis=-1))
+            messages = MLP((self.hidden, self.hidden), 0, name=name)(receivers[:, :, None], sources[:, None])
             total += jnp.einsum("bnm,bnmh->bnh", edges[name], messages)
         return total
 
