@@ -10,6 +10,7 @@ _PUBLIC = {
     "SwarmNet": "swarmnet",
     "TrainConfig": "config",
     "load_model": "checkpoint",
+    "make_decentralised": "decentral",
     "make_policy": "decode",
     "make_predict": "decode",
     "model_preset": "config",

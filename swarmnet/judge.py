@@ -58,6 +58,10 @@ class Judgement:
     """File name of the policy's contact log in the run folder."""
     contacts: bool
     """Whether bodies collide, or contacts come from recorded positions."""
+    nearest: int | None = None
+    """Others that each agent of a decentralised model perceived."""
+    radius: float | None = None
+    """How far each agent of a decentralised model perceived [m]."""
     by_geometry: bool = False
     """Whether contacts come from positions, because policy or reference is a recording."""
     data: str | None = None
@@ -77,6 +81,7 @@ class Judgement:
         return _finite(
             {
                 "policy": self.policy, "reference": self.reference, "given": self.given, "data": self.data,
+                "nearest": self.nearest, "radius": self.radius,
                 "preset": self.preset, "engine": self.engine, "hardware": hardware(), "versions": versions(),
                 "commit": commit(), "said": self.said,
                 "prediction": {
@@ -176,13 +181,14 @@ def judge_policy(
     _record(folder, done.get(reference.name) if reference else None, done.get(source.name), log_path.name)
     acted = done.get(source.name)
     truth = next(iter(done.values()))
-    if source.model is not None and source.acts and stage.starts is None:
-        sweep(stage.world, source.model, folder, engine=stage.engine, steps=stage.steps, seed=stage.seed)
+    model = None if source.decentralised else source.model  # what predicts the whole scene at once
+    if model is not None and source.acts and stage.starts is None:
+        sweep(stage.world, model, folder, engine=stage.engine, steps=stage.steps, seed=stage.seed)
     return Judgement(
         policy=source.name,
         reference=reference.name if reference else None,
         given={"policy": source.given, "reference": reference.given if reference else None},
-        prediction=predictions(source, truth, label) if source.model is not None and reference is not None else {},
+        prediction=predictions(source, truth, label) if model is not None and reference is not None else {},
         collisions={name: collision_report(found) for name, found in done.items()} if acted else {},
         collective={name: collective_report(collective_measures(found)) for name, found in done.items()}
         if acted
@@ -190,6 +196,8 @@ def judge_policy(
         worst=worst_scenes(acted, WORST) if acted else [],
         contact_log=log_path.name if acted else None,
         contacts=by_geometry or stage.world.scene.contacts,
+        nearest=source.nearest,
+        radius=source.radius,
         by_geometry=by_geometry,
         said=_said(source, truth),
         dt=truth.dt,

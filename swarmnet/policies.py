@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Key
 
 from envs.config import World
-from envs.experts.config import EXPERTS, VicsekConfig
+from envs.experts.config import EXPERTS, Interaction, VicsekConfig
 from envs.experts.registry import make_expert
 from envs.policy import Policy
 from envs.record import Array
@@ -22,8 +22,9 @@ from envs.state import State
 from envs.storage import load
 from envs.trajectories import Trajectories
 from gnn.checkpoint import Model, load_model
+from gnn.decentral import make_decentralised
 from gnn.decode import make_policy
-from swarm_mjcf.errors import SwarmError
+from swarm_mjcf.errors import SpecError, SwarmError
 
 EXPERT = "expert"
 """The name of a preset's own expert."""
@@ -49,6 +50,15 @@ class Source:
     model: Model | None = None
     recording: Trajectories | None = None
     folder: Path | None = None
+    nearest: int | None = None
+    """Each agent runs the model on its own and perceives only this many others, the nearest (`gnn.decentral`)."""
+    radius: float | None = None
+    """The same for others and obstacles closer than this [m]."""
+
+    @property
+    def decentralised(self) -> bool:
+        """Whether each agent runs the model on what it perceives; else one pass sees the whole scene."""
+        return self.nearest is not None or self.radius is not None
 
     @property
     def foreign(self) -> bool:
@@ -63,7 +73,9 @@ class Source:
     def policy(self, world: World) -> tuple[Policy, object]:
         """The policy for a world, and its parameters. Raises SwarmError for what cannot act."""
         if self.model is not None:
-            return make_policy(self.model.config, self.model.scales, goal=world.scene.goal), self.model.params
+            sight = {"nearest": self.nearest, "radius": self.radius} if self.decentralised else {}
+            make = make_decentralised if sight else make_policy
+            return make(self.model.config, self.model.scales, goal=world.scene.goal, **sight), self.model.params
         if self.make is None:
             raise PolicyError(f"{self.given}: recorded trajectories cannot steer agents")
         return self.make(world), None
@@ -102,6 +114,23 @@ def model_source(folder: Path) -> Source:
     run = folder if (folder / "checkpoints").is_dir() or folder.name != "checkpoints" else folder.parent
     model = load_model(run / "checkpoints")
     return Source(given=str(folder), name=f"swarmnet {model.about['preset']}", model=model, folder=run)
+
+
+def with_sight(source: Source, *, nearest: int | None = None, radius: float | None = None) -> Source:
+    """The same model, run by each agent on the `nearest` others and on whatever is closer than `radius` [m].
+
+    Raises SpecError for anything but a trained model that acts, and for numbers that are no limit.
+    """
+    given = {"nearest": nearest, "radius": radius}
+    limits = {field: value for field, value in given.items() if value is not None}
+    if not limits:
+        return source
+    if source.model is None or not source.acts:
+        field, value = next(iter(limits.items()))
+        raise SpecError(field, value, f"nothing beside {source.given}: it limits what agents with a trained model see")
+    Interaction(**limits)
+    words = {"nearest": f"{nearest} nearest", "radius": f"within {radius} m"}
+    return replace(source, name=", ".join([source.name, *(words[field] for field in limits)]), **limits)
 
 
 def _expert(name: str, world: World) -> Policy:

@@ -34,7 +34,9 @@ def commands(facts: Facts) -> list[tuple[str, str]]:
         judged = {"data": facts.recorded} | {k: v for k, v in _given(facts).items() if k != "reference"}
         found.append((["swarmnet", "evaluate", str(run), *_flags(Evaluate, judged)], "tables, figures, videos"))
     elif e:
-        judged = {key: e[key] for key in ("scenes", "steps", "seed", "preset") if key in e} | _given(facts)
+        judged = {
+            key: e[key] for key in ("scenes", "steps", "seed", "preset", "nearest", "radius") if key in e
+        } | _given(facts)
         if e.get("preset") == about.get("data", {}).get("simulate", {}).get("preset"):
             judged.pop("preset", None)  # the model's training world, whatever else was set there
         elif facts.counts and judged.get("preset"):

@@ -15,8 +15,9 @@ from envs.experts.registry import make_expert
 from envs.state import State
 from envs.storage import save
 from envs.swarm_env import scene_keys
+from swarm_mjcf.errors import SpecError
 from swarm_mjcf.spec import SceneSpec
-from swarmnet.policies import PolicyError, Source, checked, find_policy
+from swarmnet.policies import PolicyError, Source, checked, find_policy, with_sight
 
 WORLD = make_world("clear", num_agents=3)
 KEYS = scene_keys(0, range(2))
@@ -163,3 +164,8 @@ def test_an_empty_run_folder_is_refused(here: Path):
 def test_a_source_says_whether_it_acts():
     assert find_policy("expert").acts
     assert not Source(given="x.h5", name="x", recording=make_trajectories()).acts
+
+
+def test_only_a_trained_model_can_see_less():
+    with pytest.raises(SpecError, match="nearest: 3 was given, allowed is nothing beside expert"):
+        with_sight(find_policy("expert"), nearest=3)

@@ -10,7 +10,7 @@ from swarmnet.closed_loop import Stage, stage_of_recording
 from swarmnet.config import Evaluate
 from swarmnet.figures_recorded import show_windows
 from swarmnet.judge import Judgement, judge_policy, judge_recorded, tables, training_world
-from swarmnet.policies import EXPERT, Source, find_policy, model_source
+from swarmnet.policies import EXPERT, Source, find_policy, model_source, with_sight
 from swarmnet.progress import progress
 from swarmnet.report import write_report
 from swarmnet.results import Results, Row, write_results
@@ -33,6 +33,7 @@ def run(config: Evaluate) -> int:
         _check_alone(config)
         judgement = judge_recorded(source, config.data, folder)
     else:
+        source = with_sight(source, nearest=config.nearest, radius=config.radius)
         reference = None if config.reference == NONE else find_policy(config.reference)
         stage, reference = _stage(config, source, reference)
         judgement = judge_policy(source, reference, stage, folder, log=config.log)
