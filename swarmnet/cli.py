@@ -12,6 +12,7 @@ import tyro
 
 from swarm_mjcf.errors import SwarmError
 from swarmnet.config import (
+    RL,
     Bench,
     Command,
     Demo,
@@ -35,6 +36,7 @@ _MODULES: dict[type, str] = {
     Merge: "swarmnet.commands.merge",
     Train: "swarmnet.commands.train",
     Schedule: "swarmnet.commands.schedule",
+    RL: "swarmnet.commands.rl",
     Evaluate: "swarmnet.commands.evaluate",
     Learn: "swarmnet.commands.learn",
     Probe: "swarmnet.commands.probe",

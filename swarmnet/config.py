@@ -11,7 +11,7 @@ from envs.config import SimulateConfig
 from envs.importers.config import ImportConfig
 from envs.shards import Shard
 from swarm_mjcf.errors import SpecError
-from swarmnet.config_learning import Evaluate, Learn, Probe, Reproduce, Schedule, Train
+from swarmnet.config_learning import RL, Evaluate, Learn, Probe, Reproduce, Schedule, Train
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,13 +228,14 @@ class Bench:
     `adapters` (Gymnasium, PettingZoo, dm_env, as ratios to the environment itself), `throughput` (10 agents and 5
     obstacles with random actions and resets, batches up to 32k on a GPU), `imitation` (simulate, train, prediction
     error), `train` (windows/s, the share of time in the compiled step, one core against Keras where it is installed),
-    `rendering` (frame rates), `build` (scenes per second).
+    `rl` (env-steps/s of physics, rollout, update and whole PPO, beside the arithmetic's own time), `rendering` (frame
+    rates), `build` (scenes per second).
 
     Example:
       swarmnet bench engines --json docs/results/bench-engines.json
     """
 
-    what: Literal["engines", "experts", "adapters", "throughput", "imitation", "train", "rendering", "build"]
+    what: Literal["engines", "experts", "adapters", "throughput", "imitation", "train", "rl", "rendering", "build"]
     """What to measure."""
     agents: tuple[int, ...] = (5, 10, 20, 100, 1000)
     """engines, experts: numbers of agents, each with 1 obstacle."""
@@ -245,7 +246,7 @@ class Bench:
     engine: tuple[str, ...] = ("native", "mjx")
     """throughput: engines to measure."""
     batch: tuple[int, ...] = ()
-    """throughput: scenes per batch; by default 64 and 512 on a CPU, 1024 to 32768 on a GPU."""
+    """throughput, rl: scenes per batch; by default 64 and 512 (rl: 64, 256, 1024) on a CPU, 1024 to 32768 on a GPU."""
     scenes: int = 2000
     """imitation, train: training scenes."""
     scale: float = 0.8
@@ -267,6 +268,7 @@ Command = (
     | Merge
     | Train
     | Schedule
+    | RL
     | Evaluate
     | Learn
     | Probe

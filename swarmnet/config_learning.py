@@ -1,11 +1,13 @@
 """The command line of learning, judging and reproducing; see `swarmnet.config`. Standard library only."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from envs.config import RewardConfig
 from gnn.config import TrainConfig
+from rl.config import PPOConfig
 from swarm_mjcf.errors import SpecError
 
 
@@ -46,6 +48,55 @@ class Train(TrainConfig):
                 raise SpecError("minutes", self.minutes, "a finite number above 0")
             if self.scale != 1:
                 raise SpecError("scale", self.scale, "1 with --minutes, which decides the number of steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RL(PPOConfig):
+    """Improve a trained SwarmNet by PPO in MuJoCo, with a reward for the goal and against contacts, or go on with it.
+
+    The imitated policy becomes the mean of a Gaussian, a second readout learns the value. Modes as in the thesis: 0
+    frees all weights, 1 freezes the goal's edge function, 2 frees the edge functions of obstacles and agents alone.
+    Scenes are those of the data that the model was trained on, with fresh starts. RUN gets checkpoints/ (a model like
+    any other), metrics.jsonl, tensorboard/, videos of both policies in the same unseen scenes, and report.html.
+
+    Example:
+      swarmnet simulate --preset clear --mixed --num-obstacles 3 --scenes 1000 --out runs/few.h5
+      swarmnet train runs/few.h5 --run runs/few --model thesis-ch5
+      swarmnet rl runs/few --run runs/few-rl --mode 2 --minutes 10
+    """
+
+    init: Path
+    """Run folder with the trained model: preset thesis-ch5 or best."""
+    run: Path = Path("runs/improved")
+    """Run folder."""
+    mode: Literal[0, 1, 2] = 0
+    """What stays as it is, besides what --freeze names."""
+    scratch: bool = False
+    """Start from random weights of the model's preset: what imitation is worth."""
+    minutes: float | None = None
+    """Wall time of the training, compilation included, in place of --iterations."""
+    horizon: int = 60
+    """Control steps per episode."""
+    terminate_on_contact: bool = False
+    """End an episode at any contact; otherwise a contact costs and the scene goes on."""
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    """Coefficients of the reward."""
+    engine: str = "auto"
+    """Physics engine: auto, native, mjx, mjx-warp."""
+    devices: int | None = None
+    """Devices that share the scenes; all by default."""
+    test_scenes: int = 200
+    """Unseen scenes that both policies are judged on in the end; 0: none."""
+    videos: int = 3
+    """Worst scenes to make videos of."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise SpecError("minutes", self.minutes, "a finite number above 0")
+        for name, least in (("horizon", 1), ("test_scenes", 0), ("videos", 0)):
+            if getattr(self, name) < least:
+                raise SpecError(name, getattr(self, name), f"at least {least}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,9 +143,9 @@ class Schedule(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for field in ("scenes", "steps_per_scene", "test_scenes"):
-            if getattr(self, field) < 1:
-                raise SpecError(field, getattr(self, field), "at least 1")
+        for name in ("scenes", "steps_per_scene", "test_scenes"):
+            if getattr(self, name) < 1:
+                raise SpecError(name, getattr(self, name), "at least 1")
         if not self.test_sizes or min(self.test_sizes) < 1:
             raise SpecError("test_sizes", self.test_sizes, "at least one size, each at least 1")
         if not 0 < self.validation < 1:
@@ -126,6 +177,7 @@ class Evaluate:
       swarmnet evaluate runs/clear --scenes 200 --json evaluation.json
       swarmnet evaluate --policy helbing --preset clear
       swarmnet evaluate runs/mine --policy mymodule:policy --reference runs/clear
+      swarmnet evaluate runs/near --policy runs/clear --nearest 3 --reference runs/clear
       swarmnet evaluate --policy recorded.h5 --log parquet
       swarmnet evaluate runs/walks --data runs/walks_holdout.h5
     """
@@ -151,6 +203,11 @@ class Evaluate:
     """Largest number of agents per scene; the world's own by default."""
     num_obstacles: int | None = None
     """Largest number of obstacles per scene; the world's own by default."""
+    nearest: int | None = None
+    """Run the model decentralised: each agent on its own, perceiving only this many others, the nearest. Judge it by
+    the centralised model (--reference RUN) to see what is lost."""
+    radius: float | None = None
+    """The same with others and obstacles closer than this alone [m]; with --nearest, both hold."""
     perception_noise: float | None = None
     """Standard deviation of noise on all that both policies see [m and m/s]; that of the training data by default."""
     actuation_noise: float | None = None

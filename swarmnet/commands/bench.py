@@ -19,6 +19,7 @@ from swarm_mjcf.spec import SceneSpec
 from swarmnet.bench_adapters import bench_adapters
 from swarmnet.bench_engines import bench_engines
 from swarmnet.bench_experts import bench_experts
+from swarmnet.bench_rl import PUBLISHED_RATE, bench_rl
 from swarmnet.bench_throughput import bench_throughput
 from swarmnet.bench_train import bench_loop, bench_one_core
 from swarmnet.commands.train import note
@@ -110,6 +111,26 @@ def _throughput(config: Bench) -> Results:
     return Results(name="bench-throughput", rows=rows, seeds=[config.seed])
 
 
+def _rl(config: Bench) -> Results:
+    rows, device = [], jax.devices()[0]
+    print(f"device: {device.device_kind}", flush=True)
+    batch = config.batch or ((64, 256, 1024) if device.platform == "cpu" else (1024, 4096, 16384, 32768))
+    for cell in bench_rl(batch, seed=config.seed):
+        figures = (
+            ("engine env-steps/s", cell.engine, "1/s", None),
+            ("rollout env-steps/s", cell.rollout, "1/s", None),
+            ("update env-steps/s", cell.update, "1/s", None),
+            ("training env-steps/s", cell.training, "1/s", PUBLISHED_RATE),
+            ("training ratio to engine", cell.training / cell.engine, "1", None),
+            ("floor over training", cell.floor / cell.training, "1", None),
+            ("operations per env-step", cell.operations, "1", None),
+        )
+        for figure, value, unit, reference in figures:
+            print(f"rl.{cell.network.replace(' ', '_')}.s{cell.scenes}.{_metric(figure)} {value:.4g}", flush=True)
+            rows.append(Row(cell.network, f"S={cell.scenes} {figure}", value, reference=reference, unit=unit))
+    return Results(name="bench-rl", rows=rows, seeds=[config.seed])
+
+
 def _imitation(config: Bench) -> Results:
     """Published Boids, contacts off: simulate, train, predict unseen runs."""
     rows: list[Row] = []
@@ -197,6 +218,7 @@ _MEASURES = {
     "throughput": _throughput,
     "imitation": _imitation,
     "train": _train,
+    "rl": _rl,
     "rendering": _rendering,
     "build": _build,
 }

@@ -1,0 +1,76 @@
+"""Configuration of PPO. Standard library only."""
+
+import math
+from dataclasses import dataclass
+
+from swarm_mjcf.errors import SpecError
+
+MODES: dict[int, tuple[str, ...]] = {
+    0: (),
+    1: ("edge/goal/*",),
+    2: ("edge/goal/*", "node/*", "readout/*"),
+}
+"""What a mode of section 5.6.3 keeps as it is: nothing; the goal's edge function; all but those of obstacles and agents
+(the value's readout and the exploration are always free)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig:
+    """Proximal policy optimisation (Schulman et al. 2017) of a swarm's policy, every agent a learner."""
+
+    seed: int = 0
+    """Scenes, exploration, order of minibatches, first weights of the value's readout."""
+    scenes: int = 256
+    """Scenes under way at once."""
+    steps: int = 32
+    """Control steps of each scene between updates."""
+    iterations: int = 100
+    """Rollouts with an update each."""
+    warmup: int = 5
+    """First iterations, in which the value's readout alone learns."""
+    epochs: int = 4
+    """Passes over each rollout."""
+    minibatches: int = 4
+    """Parts of a pass, by control steps; must divide `steps`."""
+    gamma: float = 0.95
+    """Discount per control step."""
+    gae_lambda: float = 0.95
+    """Of generalised advantage estimation (Schulman et al. 2016)."""
+    clip: float = 0.2
+    """Largest change of an action's probability ratio that is rewarded."""
+    learning_rate: float = 3e-4
+    """Of Adam."""
+    max_grad_norm: float = 0.5
+    """Largest global norm of a gradient; the value's readout has a norm of its own."""
+    value_weight: float = 0.5
+    """Weight of the value's error, which is measured in the variance of the returns."""
+    entropy_weight: float = 0.0
+    """Weight of the entropy bonus."""
+    imitation_weight: float = 0.0
+    """Weight of the squared distance from the first policy's actions, in units of the acceleration limit."""
+    initial_std: float = 0.2
+    """Exploration at the start: standard deviation of each action in units of the acceleration limit."""
+    target_kl: float = 0.03
+    """An update ends early when the policy has moved this far from the one that acted."""
+    freeze: tuple[str, ...] = ()
+    """Patterns over the paths of weights that stay as they are (`MODES`; * stands for any text)."""
+    checkpoint_seconds: float = 60.0
+    """Longest time between checkpoints [s]."""
+
+    def __post_init__(self) -> None:
+        for field in ("scenes", "steps", "iterations", "epochs", "minibatches"):
+            if getattr(self, field) < 1:
+                raise SpecError(field, getattr(self, field), "at least 1")
+        if self.steps % self.minibatches:
+            raise SpecError("minibatches", self.minibatches, f"a divisor of steps = {self.steps}")
+        if self.warmup < 0:
+            raise SpecError("warmup", self.warmup, "at least 0")
+        for field in ("gamma", "gae_lambda"):
+            if not 0 <= getattr(self, field) <= 1:
+                raise SpecError(field, getattr(self, field), "from 0 to 1")
+        for field in ("clip", "learning_rate", "max_grad_norm", "initial_std", "target_kl"):
+            if not 0 < getattr(self, field) < math.inf:
+                raise SpecError(field, getattr(self, field), "a finite number above 0")
+        for field in ("value_weight", "entropy_weight", "imitation_weight"):
+            if not 0 <= getattr(self, field) < math.inf:
+                raise SpecError(field, getattr(self, field), "a finite number of at least 0")
