@@ -20,25 +20,25 @@ class PPOConfig:
 
     seed: int = 0
     """Scenes, exploration, order of minibatches, first weights of the value's readout."""
-    scenes: int = 256
+    scenes: int = 64
     """Scenes under way at once."""
-    steps: int = 32
+    steps: int = 60
     """Control steps of each scene between updates."""
     iterations: int = 100
     """Rollouts with an update each."""
-    warmup: int = 5
+    warmup: int = 8
     """First iterations, in which the value's readout alone learns."""
-    epochs: int = 4
+    epochs: int = 2
     """Passes over each rollout."""
     minibatches: int = 4
     """Parts of a pass, by control steps; must divide `steps`."""
     gamma: float = 0.95
     """Discount per control step."""
-    gae_lambda: float = 0.95
+    gae_lambda: float = 0.9
     """Of generalised advantage estimation (Schulman et al. 2016)."""
     clip: float = 0.2
     """Largest change of an action's probability ratio that is rewarded."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 4e-4
     """Of Adam."""
     max_grad_norm: float = 0.5
     """Largest global norm of a gradient; the value's readout has a norm of its own."""
@@ -48,7 +48,7 @@ class PPOConfig:
     """Weight of the entropy bonus."""
     imitation_weight: float = 0.0
     """Weight of the squared distance from the first policy's actions, in units of the acceleration limit."""
-    initial_std: float = 0.2
+    initial_std: float = 0.1
     """Exploration at the start: standard deviation of each action in units of the acceleration limit."""
     target_kl: float = 0.03
     """An update ends early when the policy has moved this far from the one that acted."""

@@ -65,7 +65,7 @@ def bench_rl(scenes: tuple[int, ...], *, engine: str = "auto", seed: int = 0) ->
     rate = matrix_rate()
     for name, config in SIZES.items():
         for count in scenes:
-            yield _measure(name, config, PPOConfig(scenes=count, steps=32, warmup=0, seed=seed), engine, rate)
+            yield _measure(name, config, PPOConfig(scenes=count, steps=32, warmup=0, epochs=4, seed=seed), engine, rate)
 
 
 def _measure(name: str, network: ModelConfig, config: PPOConfig, engine: str, rate: float) -> Speed:

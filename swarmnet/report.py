@@ -5,26 +5,33 @@ import mimetypes
 import platform
 import re
 import shlex
+from dataclasses import fields, replace
 from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
 
+from envs.config import RewardConfig
+from envs.plain import plain
 from envs.trajectories import versions
 from gnn.config import TrainConfig
 from swarm_mjcf.errors import SwarmError
+from swarmnet.config import RL
 from swarmnet.figures import FigureFile, make_figures
 from swarmnet.figures_collective import make_collective_figures
 from swarmnet.figures_recorded import make_recorded_figures
+from swarmnet.figures_rl import make_rl_figures
 from swarmnet.report_commands import commands, render_command, two_recordings
 from swarmnet.report_facts import Facts, gather
 from swarmnet.report_tables import (
     collective_table,
     collision_cells,
     interval_of,
+    mode_of,
     number,
     plain_words,
+    ppo_table,
     prediction_tables,
     shown,
     worst_table,
@@ -32,7 +39,7 @@ from swarmnet.report_tables import (
 from swarmnet.results import commit, hardware, write_whole
 from swarmnet.videos import VideoFile, find_videos
 
-_FIGURES = (make_figures, make_collective_figures, make_recorded_figures)
+_FIGURES = (make_rl_figures, make_figures, make_collective_figures, make_recorded_figures)
 
 
 def write_report(run: str | Path) -> Path:
@@ -57,12 +64,13 @@ def write_report(run: str | Path) -> Path:
             "windows" if facts.recorded else "videos": "".join(
                 _video(video, first=not k) for k, video in enumerate(find_videos(run))
             ),
+            **ppo_table(facts),
             **prediction_tables(facts.evaluation, facts.model),
             **collision_cells(facts.evaluation),
             **collective_table(facts.evaluation),
             **worst_table(facts.evaluation),
             "settings": _settings(facts),
-            "again": "\n".join(f"{escape(line)}  <i># {escape(why)}</i>" for line, why in commands(facts)),
+            "again": "\n".join(f"{escape(line)}  <i># {escape(why)}</i>" for line, why in _again(facts)),
             **_notes(facts),
         }
     )
@@ -83,13 +91,12 @@ def _lead(facts: Facts) -> str:
     """One paragraph in plain words."""
     said = []
     if facts.about:
-        data, train = facts.about["data"], facts.about["train"]
-        source = f"the {data['expert'].title()} expert" if "expert" in data else "recorded agents"
-        world = f" in the world <code>{escape(str(data['simulate']['preset']))}</code>" if "simulate" in data else ""
+        name = f"A SwarmNet (preset <code>{escape(facts.about['preset'])}</code>)"
+        said.append(f"{name} {_watched(facts) if facts.imitation else 'began with random weights'}.")
+    if facts.about and facts.ppo:
+        steps = f", {facts.metrics[-1]['env_steps']:.0f} env-steps" if facts.metrics else ""
         said.append(
-            f"A SwarmNet (preset <code>{escape(facts.about['preset'])}</code>) watched {data['scenes']} scenes of "
-            f"{escape(source)}{world} and was trained for {facts.about['step']} gradient steps{_minutes(facts)}, on "
-            f"predictions of up to {max(train['horizons'])} steps."
+            f"PPO then improved it in {facts.about['step']} iterations{steps}{_minutes(facts)} ({mode_of(facts.ppo)})."
         )
     if facts.evaluation:
         e, (_, obstacles, agents) = facts.evaluation, facts.counts or (0, 0, 0)
@@ -130,10 +137,25 @@ def _lead(facts: Facts) -> str:
     return " ".join(said) or "This folder holds no trained model and no evaluation yet."
 
 
+def _watched(facts: Facts) -> str:
+    """What was imitated."""
+    about = facts.imitation or {}
+    data, horizons = about["data"], about["train"]["horizons"]
+    source = f"the {data['expert'].title()} expert" if "expert" in data else "recorded agents"
+    world = f" in the world <code>{escape(str(data['simulate']['preset']))}</code>" if "simulate" in data else ""
+    return (
+        f"watched {data['scenes']} scenes of {escape(source)}{world} and was trained for {about['step']} gradient "
+        f"steps{'' if facts.ppo else _minutes(facts)}, on predictions of up to {max(horizons)} steps"
+    )
+
+
 def _minutes(facts: Facts) -> str:
-    """Time spent in gradient steps and validation, from the metrics."""
-    before = [0, *(row["step"] for row in facts.metrics)]
-    seconds = sum((r["step"] - b) / r["steps_per_second"] for b, r in zip(before, facts.metrics, strict=False))
+    """Time spent in gradient steps and validation, or in iterations of PPO, from the metrics."""
+    if facts.ppo:
+        seconds = facts.metrics[-1]["spent"] if facts.metrics else 0.0
+    else:
+        before = [0, *(row["step"] for row in facts.metrics)]
+        seconds = sum((r["step"] - b) / r["steps_per_second"] for b, r in zip(before, facts.metrics, strict=False))
     return f" ({seconds / 60:.1f} minutes)" if seconds >= 60 else f" ({seconds:.0f} seconds)" if seconds else ""
 
 
@@ -213,7 +235,7 @@ def _figure(figure: FigureFile) -> str:
 
 def _settings(facts: Facts) -> str:
     """Everything that was set, as cards that open."""
-    e, about = facts.evaluation or {}, facts.about or {}
+    e, about, imitation = facts.evaluation or {}, facts.about or {}, facts.imitation or {}
     data = about.get("data", {})
     world = data.get("world", {})
     judged = {key: e.get(key) for key in ("data", "preset", "engine", "scenes", "steps", "dt", "seed", "contacts")}
@@ -225,7 +247,9 @@ def _settings(facts: Facts) -> str:
         "World: scene": world.get("scene", {}),
         "World: expert and start": world.get("expert", {}) | world.get("spawn", {}),
         "Model": {"preset": about.get("preset")} | about.get("model", {}),
-        "Training": {"steps done": about.get("step")} | about.get("train", {}),
+        "Imitation" if facts.ppo else "Training": {"steps done": imitation.get("step")} | imitation.get("train", {}),
+        "PPO: reward": about.get("reward", {}),
+        "PPO: scenes": {key: about.get("task", {}).get(key) for key in ("horizon", "terminate_on_contact", "engine")},
         "Evaluation": judged | counts,
         "Software": software | (e.get("versions") or data.get("versions") or versions()),
         "Hardware" + ("" if "hardware" in e else " that wrote this page"): e.get("hardware") or hardware(),
@@ -239,9 +263,42 @@ def _settings(facts: Facts) -> str:
     return "".join(shown)
 
 
+def _again(facts: Facts) -> list[tuple[str, str]]:
+    """The commands; before PPO come those of the run that it started from."""
+    lines, data = commands(facts), ("simulate", "train", "demo", "import", "learn")
+    if not facts.ppo:
+        return lines
+    begun = facts.origin or facts.run.with_name(f"{facts.run.name}-imitation")
+    before = commands(
+        replace(facts, run=begun, about=facts.imitation or facts.about, evaluation=None, metrics=[], demo=None)
+    )
+    return [
+        *(line for line in before if line[0].split()[1] in data),
+        (_rl_command(facts, begun), "PPO"),
+        *(line for line in lines if line[0].split()[1] not in data),
+    ]
+
+
+def _rl_command(facts: Facts, begun: Path) -> str:
+    """The command that improves the model of `begun` in this way."""
+    about, ppo = facts.about or {}, facts.ppo or {}
+    words = ["swarmnet", "rl", str(begun), "--run", str(facts.run), "--iterations", str(about["step"])]
+    words += [] if about.get("initial") else ["--scratch"]
+    mode = mode_of(ppo).removeprefix("mode ")
+    words += ["--mode", mode] if mode.isdigit() else ["--freeze", *ppo["freeze"]]
+    usual = {field.name: field.default for field in fields(RL)}
+    usual |= {f"reward.{name}": value for name, value in plain(RewardConfig()).items()}
+    given = ppo | {name: about["task"][name] for name in ("horizon", "terminate_on_contact")}
+    given |= {f"reward.{name}": value for name, value in about["reward"].items()}
+    for name, value in given.items():
+        if name != "freeze" and value is not None and value != usual.get(name):
+            words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
+    return shlex.join(words)
+
+
 def _notes(facts: Facts) -> dict[str, str]:
     """Which of the template's notes hold, with their numbers."""
-    e, about = facts.evaluation, facts.about
+    e, about = facts.evaluation, None if facts.ppo else facts.about
     planned = sum(about["train"]["stage_steps"]) if about else 0
     full = TrainConfig().steps
     found = {

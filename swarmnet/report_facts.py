@@ -41,6 +41,26 @@ class Facts:
         """File of the recorded trajectories that were predicted; empty where policies were judged by what they do."""
         return (self.evaluation or {}).get("data") or ""
 
+    @property
+    def ppo(self) -> dict | None:
+        """Settings of the PPO that improved the model; None where none did."""
+        return (self.about or {}).get("rl")
+
+    @property
+    def imitation(self) -> dict | None:
+        """Description of what has learned by imitation: of the model, or of the one that PPO started from; None for
+        random weights."""
+        about = self.about
+        while about and "rl" in about:
+            about = about.get("initial")
+        return about
+
+    @property
+    def origin(self) -> Path | None:
+        """Run folder that PPO started from, where the evaluation names it as reference."""
+        given = (self.evaluation or {}).get("given", {}).get("reference")
+        return Path(given) if self.ppo and given and (Path(given) / "checkpoints").is_dir() else None
+
     def pair(self, figure: str) -> tuple[dict, dict] | None:
         """Estimates of policy and reference, where both were measured; contact figures only with contacts on."""
         e = self.evaluation or {}

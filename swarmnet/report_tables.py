@@ -3,6 +3,9 @@
 from html import escape
 
 from envs.collective import UNITS
+from rl.config import MODES
+from swarmnet.figures_rl import WINDOW, final_return, smoothed
+from swarmnet.report_facts import Facts
 
 
 def collision_cells(evaluation: dict | None) -> dict[str, str]:
@@ -41,6 +44,39 @@ def worst_table(evaluation: dict | None) -> dict[str, str]:
         for w in e["worst"]
     ]
     return {"worst": "".join(rows), "contact_log": escape(e.get("contact_log") or "")}
+
+
+def ppo_table(facts: Facts) -> dict[str, str]:
+    """How PPO improved a model: what it started from, what stayed as it was, what it gained, and its settings."""
+    about, ppo, rows = facts.about or {}, facts.ppo, facts.metrics
+    if not ppo:
+        return {}
+    began = about.get("initial")
+    start = "Started from random weights."
+    if began:
+        where = f" in <code>{escape(str(facts.origin))}</code>" if facts.origin else ""
+        start = (
+            f"Started from the imitation policy{where}: weights <code>{escape(began['weights'])}</code>, preset "
+            f"<code>{escape(str(began.get('preset')))}</code> at step {began.get('step')}."
+        )
+    patterns = ", ".join(f"<code>{escape(pattern)}</code>" for pattern in ppo["freeze"])
+    kept = f"{patterns} {'stay as they were' if patterns else 'nothing stays as it was'}".strip()
+    gained = (
+        f" Mean return of an episode: {number(smoothed(rows[:WINDOW])[-1])} in the first {min(WINDOW, len(rows))} "
+        f"iterations, {number(final_return(rows))} in the last tenth of {len(rows)}."
+        if rows
+        else ""
+    )
+    known = {name: value for name, value in ppo.items() if value is not None and name != "freeze"}
+    cells = "".join(
+        f"<tr><th>{escape(name)}</th><td>{escape(plain_words(value))}</td></tr>" for name, value in known.items()
+    )
+    return {"improved": f"{start} {mode_of(ppo).capitalize()}: {kept}.{gained}", "ppo": f"<tbody>{cells}</tbody>"}
+
+
+def mode_of(ppo: dict) -> str:
+    """`mode 1`, or `no mode` for any other set of frozen parts."""
+    return next((f"mode {mode}" for mode, kept in MODES.items() if list(kept) == list(ppo["freeze"])), "no mode")
 
 
 def prediction_tables(evaluation: dict | None, model: str) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """PPO on a SwarmNet in physics: going on, freezing, divergence, engines; the actor-critic against its own network."""
 
+import re
 import shutil
 from dataclasses import replace
 from functools import cache
@@ -24,6 +25,7 @@ from rl.config import PPOConfig
 from rl.task import SwarmTask
 from rl.train import RLError, make_learner, train
 from swarm_mjcf.errors import SpecError, SwarmError
+from swarmnet.cli import main
 
 CONFIG = PPOConfig(scenes=6, steps=4, iterations=4, warmup=1, epochs=1, minibatches=2, checkpoint_seconds=0.0)
 
@@ -203,3 +205,19 @@ def test_two_compiled_iterations_on_mjx_with_contacts_and_resets():
     worlds = [states[engine]["runner"].world for engine in ("native", "mjx")]
     np.testing.assert_array_equal(worlds[0].step, worlds[1].step)
     np.testing.assert_allclose(worlds[0].position, worlds[1].position, atol=2e-2)
+
+
+def test_the_command_says_what_is_wrong(tmp_path, capsys):
+    for arguments, message in (
+        ([str(tmp_path), "--run", str(tmp_path)], "run: .* allowed is another folder"),
+        ([str(tmp_path / "none")], "no such checkpoint folder"),
+        ([str(tmp_path), "--minutes", "0"], "minutes: 0.0 was given"),
+        ([str(tmp_path), "--steps", "30"], "minibatches: 4 was given, allowed is a divisor of steps = 30"),
+        ([str(tmp_path), "--reward.collision", "-1"], "collision: -1.0 was given"),
+    ):
+        try:
+            code = main(["rl", *arguments])
+        except SystemExit as refused:  # of a value that the parser refuses
+            code = refused.code
+        assert code == 2
+        assert re.search(message, " ".join(capsys.readouterr().err.split())), message

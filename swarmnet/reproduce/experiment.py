@@ -25,6 +25,9 @@ REGISTRY: dict[str, str] = {
     "figure-4.4": "swarmnet.reproduce.figures_4:FIGURE_4_4",
     "figure-4.5": "swarmnet.reproduce.figures_4:FIGURE_4_5",
     "figure-5.1": "swarmnet.reproduce.figure_5_1:FIGURE_5_1",
+    "figure-5.2": "swarmnet.reproduce.figures_5:FIGURE_5_2",
+    "figure-5.3": "swarmnet.reproduce.figures_5:FIGURE_5_3",
+    "figure-5.4": "swarmnet.reproduce.figures_5:FIGURE_5_4",
     "aggregation": "swarmnet.reproduce.aggregation:AGGREGATION",
     "control": "swarmnet.reproduce.control:CONTROL",
 }
