@@ -308,7 +308,7 @@ def make_figures(run: str | Path) -> list[FigureFile]:
 
 def _learning_figure(run: Path, add: Callable) -> None:
     rows = read_metrics(run / "metrics.jsonl")
-    if rows:
+    if rows and "horizon" in rows[0]:  # PPO has curves of its own
         longest = max(row["horizon"] for row in rows)
         add(
             "learning", "Learning",

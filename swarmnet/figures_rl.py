@@ -6,6 +6,7 @@ Returns are those of the policy that explores, mean over the agents of an episod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 
 import matplotlib as mpl
 import numpy as np
@@ -174,10 +175,11 @@ def policy_sheet(panels: Sequence[Panel], *, columns: int, width: str = "page", 
 
 
 def _small_print(figure: Figure, note: str) -> None:
-    """A line above the legend's entries."""
+    """Above the legend's entries, in lines as wide as the figure."""
     if note and figure.legends:
-        figure.set_figheight(figure.get_figheight() + 0.12)
-        figure.legends[0].set_title(note)
+        lines = wrap(note, round(18 * figure.get_figwidth()))
+        figure.set_figheight(figure.get_figheight() + 0.1 + 0.12 * len(lines))
+        figure.legends[0].set_title("\n".join(lines))
         figure.legends[0].get_title().set(fontsize=6, color="#4a505a")
 
 
