@@ -84,7 +84,13 @@ class RL(PPOConfig):
     engine: str = "auto"
     """Physics engine: auto, native, mjx, mjx-warp."""
     devices: int | None = None
-    """Devices that share the scenes; all by default."""
+    """Devices of every process that share the scenes; all by default."""
+    coordinator: str | None = None
+    """Several machines: HOST:PORT of process 0, as the others reach it. Under SLURM's srun nothing is to be given."""
+    processes: int | None = None
+    """Several machines: how many processes there are; each runs this same command."""
+    process: int | None = None
+    """Several machines: which of them this is, from 0."""
     test_scenes: int = 200
     """Unseen scenes that both policies are judged on in the end; 0: none."""
     videos: int = 3

@@ -5,7 +5,7 @@ from dataclasses import replace
 from envs.swarm_env import SwarmEnv
 from gnn.checkpoint import load_model
 from rl.config import MODES, PPOConfig
-from rl.devices import device_mesh
+from rl.devices import device_mesh, initialise, leads
 from rl.task import SwarmTask
 from rl.train import train
 from swarm_mjcf.errors import SpecError
@@ -20,6 +20,7 @@ ENDLESS = 10**9
 
 def run(config: RL) -> int:
     """Improves, or goes on, and judges both policies on the same unseen scenes."""
+    initialise(config.coordinator, config.processes, config.process)
     if config.run.resolve() == config.init.resolve():
         raise SpecError("run", str(config.run), "another folder than the one of the model it starts from")
     model = load_model(config.init / "checkpoints")
@@ -50,6 +51,8 @@ def run(config: RL) -> int:
             mesh=device_mesh(config.devices),
             progress=report,
         )
+    if not leads():
+        return 0
     steps = improved.about["step"] * config.scenes * config.steps
     print(f"{config.run}: {model.about['preset']} after {improved.about['step']} iterations, {steps} env-steps")
     if not config.test_scenes:
