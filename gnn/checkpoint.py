@@ -92,7 +92,9 @@ class Checkpoints:
         """The state of a checkpoint, in the structure and dtypes of `like`, or as it was saved."""
         with _explained(self.folder / str(step), "read"):
             template = None if like is None else jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
-            args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
+            # A checkpoint may come from other devices than there are here.
+            here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+            args = ocp.args.Composite(state=ocp.args.StandardRestore(template, fallback_sharding=here))
             return self._manager.restore(step, args=args)["state"]
 
     def newest(self, like: dict | None = None) -> tuple[int, dict, dict] | None:

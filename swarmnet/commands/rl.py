@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import jax
+
 from envs.swarm_env import SwarmEnv
 from gnn.checkpoint import load_model
 from rl.config import MODES, PPOConfig
@@ -55,7 +57,7 @@ def run(config: RL) -> int:
         return 0
     steps = improved.about["step"] * config.scenes * config.steps
     print(f"{config.run}: {model.about['preset']} after {improved.about['step']} iterations, {steps} env-steps")
-    if not config.test_scenes:
+    if not config.test_scenes or jax.process_count() > 1:  # loading a model needs all processes
         print(f"next: swarmnet evaluate {config.run} --reference {config.init}")
         return 0
     return evaluate.run(
