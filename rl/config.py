@@ -7,11 +7,11 @@ from swarm_mjcf.errors import SpecError
 
 MODES: dict[int, tuple[str, ...]] = {
     0: (),
-    1: ("edge/goal/*",),
-    2: ("edge/goal/*", "node/*", "readout/*"),
+    1: ("*/goal*",),
+    2: ("*/goal*", "node/*", "readout/*"),
 }
-"""What a mode of section 5.6.3 keeps as it is: nothing; the goal's edge function; all but those of obstacles and agents
-(the value's readout and the exploration are always free)."""
+"""What a mode of section 5.6.3 keeps as it is: nothing; the goal's edge function (and the reach that preset `best` has
+for it); all but those of obstacles and agents. The value's readout and the exploration are always free."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -346,7 +346,7 @@ def test_the_report_tells_of_ppo(tmp_path):
         "watched 950 scenes of the Boids expert in the world <code>clear</code> and was trained for 3000 gradient",
         "PPO then improved it in 40 iterations, 4000 env-steps (4.0 minutes) (mode 1)",
         f"Started from the imitation policy in <code>{init}</code>: weights <code>0123456789abcdef</code>",
-        "Mode 1: <code>edge/goal/*</code> stay as they were.",
+        "Mode 1: <code>*/goal*</code> stay as they were.",
         "Mean return of an episode: 4.50 in the first 10 iterations, 37.5 in the last tenth of 40.",
         "<th>learning_rate</th><td>0.001</td>",
         "Reinforcement learning",

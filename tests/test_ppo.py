@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from learning import quick_compiles
 from probes import AGENTS, Probe, probe_actor
 
+from gnn.freeze import frozen, paths_of
 from rl.actor_critic import entropy, log_probability
 from rl.collect import collect, start
 from rl.config import MODES, PPOConfig
@@ -263,6 +264,15 @@ def test_absurd_settings_are_refused_by_name(field, value):
         PPOConfig(**{field: value})
 
 
-def test_the_modes_are_the_thesis_s():
-    assert (MODES[0], MODES[1]) == ((), ("edge/goal/*",))
-    assert set(MODES[2]) == {"edge/goal/*", "node/*", "readout/*"}
+@pytest.mark.parametrize("reach", [{}, {"reach": {"goal": 0, "obstacle": 0, "agent": 0}}])
+def test_the_modes_are_the_thesis_s(reach):
+    """By what stays free, for a network as thesis-ch5 and one with a learned reach as best."""
+    kinds = {kind: {"layer0": {"kernel": 0}} for kind in ("goal", "obstacle", "agent")}
+    params = {"edge": kinds, "node": {"layer0": 0}, "readout": {"layer0": 0}, "value": 0, "log_std": 0, **reach}
+    free = {}
+    for mode, patterns in MODES.items():
+        stays = jax.tree.leaves(frozen(params, patterns))
+        free[mode] = {path for path, one in zip(paths_of(params), stays, strict=True) if not one}
+    assert free[0] == set(paths_of(params))
+    assert free[0] - free[1] == {path for path in free[0] if "goal" in path}
+    assert free[1] - free[2] == {"node/layer0", "readout/layer0"}

@@ -60,9 +60,8 @@ def run(config: RL) -> int:
     if not config.test_scenes or jax.process_count() > 1:  # loading a model needs all processes
         print(f"next: swarmnet evaluate {config.run} --reference {config.init}")
         return 0
-    return evaluate.run(
-        Evaluate(run=config.run, reference=str(config.init), scenes=config.test_scenes, videos=config.videos)
-    )
+    both = {"run": config.run, "reference": str(config.init), "engine": config.engine}
+    return evaluate.run(Evaluate(**both, scenes=config.test_scenes, videos=config.videos))
 
 
 def note(row: dict) -> str:
