@@ -1,0 +1,1 @@
+"""Safety constraints on actions, one per file."""

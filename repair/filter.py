@@ -1,0 +1,122 @@
+"""A run-time shield: the action nearest to the policy's that the constraint allows. Usable around any policy."""
+
+from itertools import combinations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from envs.dynamics import Kinematics, limited
+from envs.policy import Policy
+from envs.record import Array
+from envs.state import State
+from gnn.graph import graph_of_state
+from repair.constraints.constraint import Constraint, HalfPlanes
+from repair.encounters import Bodies, encounters
+from repair.network import Situations
+
+TIGHTEST = 8
+"""Conditions of an agent that are looked at: those with the least slack."""
+TOLERANCE = 1e-4
+"""By how much an action may violate a condition and still count as allowed [m/s^2]."""
+
+
+def nearest_allowed(
+    action: Float[Array, "R 2"], planes: HalfPlanes, limit: float
+) -> tuple[Float[Array, "R 2"], Bool[Array, " R"]]:
+    """The nearest action [m/s^2] within the half-planes and the disc of radius `limit`, and whether there is one.
+
+    A quadratic program in two variables, solved exactly: its solution is the action itself, its projection on one line
+    or on the circle, or where two of these meet; all are tried at once. Where nothing is allowed: the one of them that
+    violates the worst condition least. Only the `TIGHTEST` conditions are looked at.
+    """
+    xp = action.__array_namespace__()
+    action = _within(xp, action, limit)
+    lines = min(TIGHTEST, planes.offset.shape[1])
+    slack = xp.sum(planes.normal * action[:, None], axis=-1) - planes.offset
+    order = xp.argsort(slack, axis=1)[:, :lines]
+    n = xp.take_along_axis(planes.normal, order[..., None], axis=1)
+    b = xp.take_along_axis(planes.offset, order, axis=1)
+    real = xp.isfinite(b)
+    b = xp.where(real, b, -1e9)
+    onto = action[:, None] + xp.maximum(b - xp.sum(n * action[:, None], axis=-1), 0)[..., None] * n
+    tried = [action[:, None], onto]
+    if lines > 1:
+        first, second = (np.array(x) for x in zip(*combinations(range(lines), 2), strict=True))
+        n1, n2, b1, b2 = n[:, first], n[:, second], b[:, first], b[:, second]
+        area = n1[..., 0] * n2[..., 1] - n1[..., 1] * n2[..., 0]
+        area = xp.where(xp.abs(area) < 1e-9, 1e-9, area)
+        corner = xp.stack(
+            [(b1 * n2[..., 1] - b2 * n1[..., 1]) / area, (b2 * n1[..., 0] - b1 * n2[..., 0]) / area], axis=-1
+        )
+        tried.append(corner)
+    if np.isfinite(limit):
+        along = xp.sqrt(xp.maximum(limit * limit - b * b, 0))[..., None]
+        across = xp.stack([-n[..., 1], n[..., 0]], axis=-1)
+        foot = xp.clip(b, -limit, limit)[..., None] * n
+        tried += [foot + along * across, foot - along * across]
+    tried = _within(xp, xp.concatenate(tried, axis=1), limit)
+    worst = xp.max(xp.where(real[:, None], b[:, None] - xp.sum(n[:, None] * tried[:, :, None], axis=-1), -1e9), axis=-1)
+    fits = worst <= TOLERANCE
+    away = xp.sum((tried - action[:, None]) ** 2, axis=-1)
+    possible = xp.any(fits, axis=1)
+    best = xp.where(possible, xp.argmin(xp.where(fits, away, np.inf), axis=1), xp.argmin(worst + 1e-6 * away, axis=1))
+    return xp.take_along_axis(tried, best[:, None, None], axis=1)[:, 0], possible
+
+
+def _within(xp: object, vector: Array, limit: float) -> Array:
+    """Shortened to the limit, a hair inside it, so that rounding does not push it out."""
+    if np.isinf(limit):
+        return vector
+    size = xp.sqrt(xp.sum(vector * vector, axis=-1, keepdims=True) + 1e-18)  # type: ignore[attr-defined]
+    return vector * xp.minimum(1.0, limit / size)  # type: ignore[attr-defined]
+
+
+def safe_actions(
+    constraint: Constraint,
+    situations: Situations,
+    action: Float[Array, "R 2"],
+    bodies: Bodies,
+    kinematics: Kinematics,
+    *,
+    steps: int = 2,
+) -> tuple[Float[Array, "R 2"], Bool[Array, " R"]]:
+    """The policy's actions [m/s^2] as the constraint allows them, and for whom that is possible.
+
+    A constraint that is not convex is convexified `steps` times, each time at the action found before.
+    """
+    e = encounters(situations, bodies)
+    rounds = 1 if constraint.sides(e) is not None and constraint.name == "barrier" else steps
+    safe, possible = action, None
+    for _ in range(rounds):
+        safe, possible = nearest_allowed(action, constraint.half_planes(e, safe), kinematics.max_acceleration)
+    assert possible is not None
+    return safe, possible
+
+
+def make_filtered(
+    policy: Policy, constraint: Constraint, bodies: Bodies, kinematics: Kinematics, *, goal: bool = True
+) -> Policy:
+    """`policy` behind the constraint: a policy of the same kind. Absent agents keep the action they were given."""
+
+    def filtered(state: State, params: object, key: object = None) -> Float[Array, "S N 2"]:
+        wanted = policy(state, params, key)
+        nodes, graph = graph_of_state(state, goal=goal)
+        agents = wanted.shape[1]
+        _, obstacles, _ = graph.counts
+        first = nodes.shape[1] - agents
+        parts = {"obstacle": nodes[:, first - obstacles : first], "agent": nodes[:, first:]}
+        situations = Situations(
+            own=nodes[:, first:].reshape(-1, 4),
+            senders={name: jnp.repeat(part, agents, axis=0) for name, part in parts.items()},
+            present={
+                "obstacle": jnp.asarray(graph.obstacle).reshape(-1, obstacles),
+                "agent": jnp.asarray(graph.agent).reshape(-1, agents),
+            },
+        )
+        flat = limited(situations.own[:, 2:], jnp.asarray(wanted).reshape(-1, 2), kinematics)
+        safe, _ = safe_actions(constraint, situations, flat, bodies, kinematics)
+        safe = jnp.asarray(safe).reshape(wanted.shape)
+        return jnp.where(jnp.asarray(state.agent_present)[..., None], safe, wanted)
+
+    return filtered
