@@ -76,6 +76,8 @@ PRESETS: dict[str, ModelConfig] = {
     "thesis-ch3-blind": ModelConfig(window=5, convolutions=(32, 64), psi=True, output="state_change", context=False),
     # Chapter 5 (eq. 5.22-5.28): one state, plain sum, acceleration. Scaling is affine: inputs stay linear in the state.
     "thesis-ch5": ModelConfig(normalise=True),
+    # The same with fewer weights, for which mixed-integer programs and Gram matrices of whole parts stay small.
+    "thesis-ch5-small": ModelConfig(normalise=True, edge_hidden=(32, 32), message=16, node_hidden=(32, 32)),
     # Ours; with dropout, for uncertainty (SwarmNet+); with forces for messages, which separates the edge functions;
     # for crowds, where everybody sees only the nearest.
     "best": _BEST,

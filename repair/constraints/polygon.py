@@ -16,8 +16,8 @@ class Polygon(Motion):
     """max_d n_d . p' >= R + margin over the K outward normals n_d of a regular polygon around the disc.
 
     p' = p + v dt + dt^2 (k + 1) / (2 k) u is the relative position after the step. Slack is that maximum less
-    R + margin, in m. Exact in a mixed-integer program, with a binary for each edge; the polygon's area beyond the disc's is
-    forbidden for nothing: a share of (K / pi) tan(pi / K) - 1, 27% for K = 4 and 1.3% for K = 16.
+    R + margin, in m. Exact in a mixed-integer program, with a binary for each edge. Of the disc's area, a share of
+    (K / pi) tan(pi / K) - 1 more is forbidden: 27% for K = 4, 1.3% for K = 16.
     """
 
     edges: int = 16
