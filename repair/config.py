@@ -1,6 +1,7 @@
 """Settings of repair as plain data. Standard library only."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from swarm_mjcf.errors import SpecError
 
@@ -35,3 +36,98 @@ class ConstraintConfig:
             raise SpecError("edges", self.edges, "at least 3")
         if self.horizon < 1:
             raise SpecError("horizon", self.horizon, "at least 1 control step")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescentConfig:
+    """Adam towards the filter's actions (`repair.descend`)."""
+
+    steps: int = 3000
+    """Gradient steps of a round, in chunks of 250."""
+    batch: int = 512
+    """Decisions per gradient step."""
+    learning_rate: float = 3e-3
+    """At the first step; a cosine takes it to 0."""
+    price: float = 1.0
+    """Of missing a condition by 1 m/s^2, beside half the squared deviation of an action [(m/s^2)^2]."""
+    margin: float = 0.2
+    """Added to every condition [m/s^2]."""
+    clip_norm: float = 1.0
+    """Largest global norm of a gradient."""
+    average: float = 0.995
+    """Decay per step of the running mean of the weights that is the result."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch"):
+            if getattr(self, name) < 1:
+                raise SpecError(name, getattr(self, name), "at least 1")
+        for name in ("learning_rate", "clip_norm"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise SpecError(name, getattr(self, name), "a finite number above 0")
+        for name in ("price", "margin"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise SpecError(name, getattr(self, name), "a finite number of at least 0")
+        if not 0 <= self.average < 1:
+            raise SpecError("average", self.average, "from 0 up to 1")
+
+
+EDGES = ("edge/obstacle/*", "edge/agent/*")
+"""Edge functions of what can be touched."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopConfig:
+    """The counter-example loop (`repair.loop`)."""
+
+    constraint: ConstraintConfig = field(default_factory=ConstraintConfig)
+    """What must hold."""
+    free: tuple[str, ...] = (*EDGES, "node/*", "readout/*")
+    """Weights that may change, as patterns over their paths."""
+    polish: tuple[str, ...] = ("node/*", "readout/*")
+    """Weights that the quadratic programs at the end may change; none: they are left out."""
+    method: Literal["distil", "relax"] = "distil"
+    """How a round changes the weights. distil: Adam towards the filter's actions, and quadratic programs at the end for
+    what still breaks the constraint. relax: quadratic programs alone, for some thousands of free weights at most."""
+    targets: Literal["filter", "own"] = "filter"
+    """Which actions it learns or holds on to: the policy's first ones as a filter would let them through, or as they
+    were (the penalty method)."""
+    rounds: int = 6
+    """Times that it acts and learns."""
+    scenes: int = 512
+    """Scenes of a round."""
+    steps: int = 50
+    """Control steps of a scene."""
+    seed: int = 0
+    """Of scenes, samples and minibatches."""
+    reserve_margin: float = 0.4
+    """Added to the constraint's margin in what is learned, so that what must hold has room [m]."""
+    reserve_share: float = 0.85
+    """Factor on the constraint's share of braking in what is learned."""
+    lessons: int = 20_000
+    """Decisions that a round adds to the pool: at most so many that the filter would change or that are near a body,
+    and as many of all."""
+    pool: int = 200_000
+    """Decisions in the pool at most; the oldest go."""
+    hard: int = 1000
+    """Counter-examples of a round that become constrained rows: the worst."""
+    anchors: int = 2000
+    """Decisions that the quadratic programs leave as they are."""
+    price: float = 100.0
+    """Of a missed condition in the quadratic programs (`repair.relax`)."""
+    descent: DescentConfig = field(default_factory=DescentConfig)
+
+    def __post_init__(self) -> None:
+        if self.method not in ("distil", "relax"):
+            raise SpecError("method", self.method, "distil or relax")
+        if self.targets not in ("filter", "own"):
+            raise SpecError("targets", self.targets, "filter or own")
+        for name, low in (("rounds", 0), ("scenes", 1), ("steps", 1), ("seed", 0), ("lessons", 1), ("pool", 1)):
+            if getattr(self, name) < low:
+                raise SpecError(name, getattr(self, name), f"at least {low}")
+        for name in ("hard", "anchors"):
+            if getattr(self, name) < 1:
+                raise SpecError(name, getattr(self, name), "at least 1")
+        if not 0 <= self.reserve_margin < float("inf"):
+            raise SpecError("reserve_margin", self.reserve_margin, "a finite number of at least 0 [m]")
+        if not 0 < self.reserve_share <= 1:
+            raise SpecError("reserve_share", self.reserve_share, "above 0, at most 1")

@@ -30,6 +30,7 @@ from swarmnet.config import (
     Simulate,
     Train,
 )
+from swarmnet.config_repair import Certify, Repair
 
 _MODULES: dict[type, str] = {
     Simulate: "swarmnet.commands.simulate",
@@ -37,6 +38,8 @@ _MODULES: dict[type, str] = {
     Train: "swarmnet.commands.train",
     Schedule: "swarmnet.commands.schedule",
     RL: "swarmnet.commands.rl",
+    Repair: "swarmnet.commands.repair",
+    Certify: "swarmnet.commands.certify",
     Evaluate: "swarmnet.commands.evaluate",
     Learn: "swarmnet.commands.learn",
     Probe: "swarmnet.commands.probe",

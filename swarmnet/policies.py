@@ -24,6 +24,9 @@ from envs.trajectories import Trajectories
 from gnn.checkpoint import Model, load_model
 from gnn.decentral import make_decentralised
 from gnn.decode import make_policy
+from repair.config import ConstraintConfig
+from repair.constraints.registry import make_constraint
+from repair.filter import make_filtered
 from swarm_mjcf.errors import SpecError, SwarmError
 
 EXPERT = "expert"
@@ -54,6 +57,8 @@ class Source:
     """Each agent runs the model on its own and perceives only this many others, the nearest (`gnn.decentral`)."""
     radius: float | None = None
     """The same for others and obstacles closer than this [m]."""
+    shield: ConstraintConfig | None = None
+    """A run-time filter lets through what this constraint allows, else the nearest action that it does."""
 
     @property
     def decentralised(self) -> bool:
@@ -72,6 +77,13 @@ class Source:
 
     def policy(self, world: World) -> tuple[Policy, object]:
         """The policy for a world, and its parameters. Raises SwarmError for what cannot act."""
+        policy, params = self._bare(world)
+        if self.shield is not None:
+            constraint = make_constraint(self.shield, world.scene)
+            policy = make_filtered(policy, constraint, world.scene, world.scene, goal=world.scene.goal)
+        return policy, params
+
+    def _bare(self, world: World) -> tuple[Policy, object]:
         if self.model is not None:
             sight = {"nearest": self.nearest, "radius": self.radius} if self.decentralised else {}
             make = make_decentralised if sight else make_policy
@@ -131,6 +143,15 @@ def with_sight(source: Source, *, nearest: int | None = None, radius: float | No
     Interaction(**limits)
     words = {"nearest": f"{nearest} nearest", "radius": f"within {radius} m"}
     return replace(source, name=", ".join([source.name, *(words[field] for field in limits)]), **limits)
+
+
+def with_shield(source: Source, shield: ConstraintConfig | None) -> Source:
+    """The same policy behind a run-time filter. Raises SpecError for what does not act."""
+    if shield is None:
+        return source
+    if not source.acts:
+        raise SpecError("filter", shield.name, f"nothing beside {source.given}: it does not act")
+    return replace(source, name=f"{source.name}, filtered", shield=shield)
 
 
 def _expert(name: str, world: World) -> Policy:

@@ -21,6 +21,7 @@ from swarmnet.config import RL
 from swarmnet.figures import FigureFile, make_figures
 from swarmnet.figures_collective import make_collective_figures
 from swarmnet.figures_recorded import make_recorded_figures
+from swarmnet.figures_repair import make_repair_figures
 from swarmnet.figures_rl import make_rl_figures
 from swarmnet.report_commands import commands, render_command, two_recordings
 from swarmnet.report_facts import Facts, gather
@@ -39,7 +40,7 @@ from swarmnet.report_tables import (
 from swarmnet.results import commit, hardware, write_whole
 from swarmnet.videos import VideoFile, find_videos
 
-_FIGURES = (make_rl_figures, make_figures, make_collective_figures, make_recorded_figures)
+_FIGURES = (make_repair_figures, make_rl_figures, make_figures, make_collective_figures, make_recorded_figures)
 
 
 def write_report(run: str | Path) -> Path:

@@ -5,12 +5,13 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from envs.config import SimulateConfig
+from repair.config import ConstraintConfig
 from swarm_mjcf.errors import SpecError, SwarmError
 from swarmnet.closed_loop import Stage, stage_of_recording
 from swarmnet.config import Evaluate
 from swarmnet.figures_recorded import show_windows
 from swarmnet.judge import Judgement, judge_policy, judge_recorded, tables, training_world
-from swarmnet.policies import EXPERT, Source, find_policy, model_source, with_sight
+from swarmnet.policies import EXPERT, Source, find_policy, model_source, with_shield, with_sight
 from swarmnet.progress import progress
 from swarmnet.report import write_report
 from swarmnet.results import Results, Row, write_results
@@ -34,11 +35,23 @@ def run(config: Evaluate) -> int:
         judgement = judge_recorded(source, config.data, folder)
     else:
         source = with_sight(source, nearest=config.nearest, radius=config.radius)
+        source = with_shield(source, shield_of(config))
         reference = None if config.reference == NONE else find_policy(config.reference)
         stage, reference = _stage(config, source, reference)
         judgement = judge_policy(source, reference, stage, folder, log=config.log)
     conclude(judgement, folder, videos=config.videos, json=config.json)
     return 0
+
+
+def shield_of(config: Evaluate) -> ConstraintConfig | None:
+    """The constraint that --filter names. Raises SpecError for its options without it."""
+    if config.filter is None:
+        default = ConstraintConfig()
+        for field, value in (("filter_margin", default.margin), ("filter_share", default.share)):
+            if getattr(config, field) != value:
+                raise SpecError(field, getattr(config, field), "nothing without --filter")
+        return None
+    return ConstraintConfig(name=config.filter, margin=config.filter_margin, share=config.filter_share)
 
 
 def conclude(judgement: Judgement, folder: Path, *, videos: int, json: Path | None = None) -> None:

@@ -28,6 +28,7 @@ REGISTRY: dict[str, str] = {
     "figure-5.2": "swarmnet.reproduce.figures_5:FIGURE_5_2",
     "figure-5.3": "swarmnet.reproduce.figures_5:FIGURE_5_3",
     "figure-5.4": "swarmnet.reproduce.figures_5:FIGURE_5_4",
+    "table-6.1": "swarmnet.reproduce.table_6_1:TABLE_6_1",
     "aggregation": "swarmnet.reproduce.aggregation:AGGREGATION",
     "control": "swarmnet.reproduce.control:CONTROL",
 }

@@ -1,0 +1,124 @@
+"""`swarmnet repair`."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from envs.plain import plain
+from gnn.checkpoint import Checkpoints, Model, load_model
+from gnn.train import fingerprint
+from repair.config import LoopConfig
+from repair.loop import Repaired, repair
+from repair.network import check_encodable
+from repair.verify import clopper_pearson
+from swarm_mjcf.errors import SpecError, SwarmError
+from swarmnet.acting import make_perform
+from swarmnet.commands import evaluate
+from swarmnet.config import Evaluate, part_of
+from swarmnet.config_repair import Repair
+from swarmnet.judge import training_world
+from swarmnet.progress import progress
+from swarmnet.results import commit, hardware, write_whole
+
+SCENES = 2_000_000
+"""Seed of the scenes that repair acts in; data, training and judging have others."""
+
+
+def run(config: Repair) -> int:
+    """Repairs, saves, and judges both policies on the same unseen scenes."""
+    if config.run.resolve() == config.init.resolve():
+        raise SpecError("run", str(config.run), "another folder than the one of the model that is repaired")
+    model = load_model(config.init / "checkpoints")
+    check_encodable(model)
+    asked = {name: value for name in ("num_agents", "num_obstacles") if (value := getattr(config, name)) is not None}
+    simulated = replace(training_world(model), engine=config.engine, **asked)
+    world, how = simulated.world(), part_of(LoopConfig, config)
+    perform = make_perform(
+        model, world, scenes=how.scenes, steps=how.steps, seed=SCENES + how.seed, engine=config.engine
+    )
+    _claim(config.run, how, model, asked)
+    with progress(f"repair by {how.method}") as update:
+
+        def report(done: int, total: int, row: dict) -> None:
+            update(done, total, note(row))
+
+        found = repair(model, how, world.scene, perform, folder=config.run / "rounds", progress=report)
+    keep(config.run, model, how, found)
+    print(words(found, how))
+    if not config.test_scenes:
+        return 0
+    both = {"run": config.run, "reference": str(config.init), "engine": config.engine}
+    return evaluate.run(Evaluate(**both, **asked, scenes=config.test_scenes, videos=config.videos))
+
+
+def note(row: dict) -> str:
+    """A round in a few words."""
+    parts = [
+        f"contact steps {100 * row['contact_steps']:.3g}%",
+        f"avoidable {100 * row['avoidable']:.3g}% of decisions",
+    ]
+    if "descent" in row:
+        parts.append(f"learning {100 * row['descent']:.0f}%")
+    if "polish" in row:
+        parts.append(f"polishing, {row['violated']} rows left")
+    return "  ".join(parts)
+
+
+def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired) -> Model:
+    """Saves the repaired model in FOLDER/checkpoints and FOLDER/repair.json; returns it as it was saved."""
+    about = {name: value for name, value in model.about.items() if name != "step"}
+    about |= {"repair": {"settings": plain(how), "status": found.status.value, "of": fingerprint(model.params)}}
+    checkpoints = Checkpoints(folder / "checkpoints")
+    step = (checkpoints.latest() or 0) + 1
+    checkpoints.save(step, {"params": jax.tree.map(np.asarray, found.params)}, about)
+    checkpoints.close()
+    document = {
+        "status": found.status.value,
+        "best_round": found.best,
+        "verification": found.verification.plain(),
+        "settings": plain(how),
+        "rounds": found.history,
+        "seconds": round(found.seconds, 1),
+        "commit": commit(),
+        "hardware": hardware(),
+    }
+    write_whole(folder / "repair.json", json.dumps(document, indent=1) + "\n")
+    return Model(model.config, model.scales, model.integrator, found.params, about | {"step": step})
+
+
+def words(found: Repaired, how: LoopConfig) -> str:
+    """What was done and what holds, in plain words."""
+    v, last = found.verification, next(row for row in found.history if row["round"] == found.best)
+    first = found.history[0]
+    touched = round(last["trajectories"] * last["scenes"])
+    _, most = clopper_pearson(touched, last["scenes"])
+    lines = [
+        f"status: {found.status.value}, after {found.seconds:.0f} s; weights of round {found.best}",
+        f"  {v.rows} training decisions that broke the {how.constraint.name} without need: "
+        f"{v.avoidable} still do as executed, {v.violated_before_clip} before the limits clip them",
+        f"  in {last['scenes']} scenes that were not learned from: contact steps {100 * first['contact_steps']:.3g}% "
+        f"-> {100 * last['contact_steps']:.3g}%; {touched} scenes with a contact, so with 95% confidence at most "
+        f"{100 * most:.2g}% of such scenes have one",
+        "  this is evidence about scenes like these, no proof for others: `swarmnet certify` proves a region",
+    ]
+    return "\n".join(lines)
+
+
+def _claim(folder: Path, how: LoopConfig, model: Model, asked: dict) -> None:
+    """Says in FOLDER/settings.json what is repaired and how; refuses a folder of another repair."""
+    mine = {"settings": plain(how), "of": fingerprint(model.params), **asked}
+    path = folder / "settings.json"
+    if path.exists():
+        try:
+            known = json.loads(path.read_text())
+        except ValueError as error:
+            raise SwarmError(f"{path}: is damaged; remove {folder} or name another --run") from error
+        if known != json.loads(json.dumps(mine)):
+            raise SwarmError(f"{folder}: holds another repair; name another --run, or remove it")
+        return
+    if (folder / "checkpoints").exists():
+        raise SwarmError(f"{folder}: holds a model that no repair made; name another --run")
+    write_whole(path, json.dumps(mine, indent=1) + "\n")

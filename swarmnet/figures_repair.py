@@ -1,0 +1,93 @@
+"""Figures of repair: contacts against what they cost, and a repair round by round."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from textwrap import wrap
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from swarm_mjcf.errors import SwarmError
+from swarmnet.figures import MODEL, NARROW, STYLE, FigureFile, blank_figure, svg
+from swarmnet.results import write_whole
+from swarmnet.sheets import STYLE as PAPER
+
+FLOOR = 0.002
+"""Contact steps [%] drawn for none at all: the axis is logarithmic."""
+
+
+def pareto(
+    points: Sequence[tuple[str, Mapping[str, float]]], contacts: str, costs: Sequence[str], *, note: str = ""
+) -> Figure:
+    """Contacts (log) over each of the costs; a colour for each name, a point for each of its `(name, values)`.
+
+    Points without a cost's value are left out of its panel: a filter has no prediction error.
+    """
+    names = list(dict.fromkeys(name for name, _ in points))
+    with mpl.rc_context(PAPER):
+        figure = blank_figure(3.5 * len(costs), 3.4)
+        colours = dict(zip(names, mpl.colormaps["tab10"](np.arange(len(names)) % 10), strict=True))
+        for column, cost in enumerate(costs):
+            ax = figure.add_subplot(1, len(costs), column + 1)
+            for name in names:
+                pairs = [(v[cost], v[contacts]) for n, v in points if n == name and _there(v, cost, contacts)]
+                if pairs:
+                    x, y = np.array(pairs).T
+                    ax.plot(x, np.maximum(y, FLOOR), "o", ms=4, color=colours[name], label=name)
+            ax.set(xlabel=cost, ylabel=contacts if column == 0 else "", yscale="log")
+            ax.axvline(1, color="0.7", lw=0.8, zorder=0)
+        handles = [Line2D([], [], marker="o", ls="", ms=4, color=colours[n], label=n) for n in names]
+        lines = wrap(note, 110)
+        figure.legend(handles=handles, loc="upper center", ncols=min(len(names), 5), frameon=False, fontsize=7)
+        figure.subplots_adjust(top=0.82, bottom=0.2 + 0.03 * len(lines), wspace=0.25, left=0.1, right=0.98)
+        figure.text(0.02, 0.01, "\n".join(lines), fontsize=6, va="bottom", color="0.35")
+    return figure
+
+
+def _there(values: Mapping[str, float], *names: str) -> bool:
+    return all(values.get(name) is not None and np.isfinite(values[name]) for name in names)
+
+
+def repair_rounds(rounds: Sequence[Mapping[str, float]]) -> Figure:
+    """Contact steps and avoidable violations of the constraint, in the fresh scenes of each round [%]."""
+    with mpl.rc_context(STYLE):
+        figure = blank_figure(NARROW, 3.2)
+        ax = figure.add_subplot()
+        numbers = [row["round"] for row in rounds]
+        for key, label, style in (
+            ("contact_steps", "control steps with a contact", "-o"),
+            ("avoidable", "decisions that break the constraint without need", "--s"),
+        ):
+            ax.plot(numbers, [max(100 * row[key], FLOOR) for row in rounds], style, ms=4, color=MODEL, label=label)
+        polished = [row["round"] for row in rounds if row.get("polished")]
+        for number in polished:
+            ax.axvline(number, color="0.8", lw=1, zorder=0)
+            ax.annotate("quadratic\nprograms", (number, 1), xycoords=("data", "axes fraction"), ha="right", va="top")
+        ax.set(xlabel="round (scenes of its own, not learned from before)", ylabel="share [%]", yscale="log")
+        ax.legend(frameon=False)
+    return figure
+
+
+def make_repair_figures(run: str | Path) -> list[FigureFile]:
+    """Writes RUN/figures/repair_rounds.svg, where the folder holds a repair. Raises SwarmError for a damaged file."""
+    path = Path(run) / "repair.json"
+    if not path.exists():
+        return []
+    try:
+        rounds = json.loads(path.read_text())["rounds"]
+    except (ValueError, KeyError) as error:
+        raise SwarmError(f"{path}: is damaged; `swarmnet repair` writes it anew") from error
+    if not rounds:
+        return []
+    file = Path(run) / "figures" / "repair_rounds.svg"
+    write_whole(file, svg(repair_rounds(rounds)))
+    return [
+        FigureFile(
+            file, "Repair, round by round",
+            "Every round acts in scenes of its own and learns from them afterwards, so each point is of scenes that "
+            f"were not learned from. On the logarithmic axis, none at all stands at {FLOOR}%.",
+        )
+    ]  # fmt: skip

@@ -1,0 +1,181 @@
+"""The run-time filter: exact against a general solver, and safe in physics."""
+
+from dataclasses import replace
+
+import cvxpy as cp
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import scene_state
+
+from envs.rollout import make_rollout
+from envs.swarm_env import SwarmEnv, scene_keys
+from repair.config import ConstraintConfig
+from repair.constraints.barrier import Barrier
+from repair.constraints.constraint import HalfPlanes
+from repair.constraints.disc import Disc
+from repair.constraints.registry import make_constraint
+from repair.encounters import encounters
+from repair.filter import TOLERANCE, make_filtered, nearest_allowed, safe_actions
+from repair.network import situations_of_state
+from swarm_mjcf.spec import SceneSpec
+
+LIMIT = 10.0
+
+
+def random_planes(seed: int, rows: int, conditions: int, near: float = 8.0) -> tuple[np.ndarray, HalfPlanes]:
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi, (rows, conditions))
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return rng.normal(0, 9, (rows, 2)), HalfPlanes(normal=normal, offset=rng.uniform(-10, near, (rows, conditions)))
+
+
+def violation(u: np.ndarray, planes: HalfPlanes) -> np.ndarray:
+    return (planes.offset - np.sum(planes.normal * u[:, None], axis=-1)).max(axis=1)
+
+
+@pytest.mark.parametrize("conditions", [1, 2, 3, 6])
+def test_nearest_is_the_solver_s(conditions):
+    wanted, planes = random_planes(conditions, 30, conditions)
+    found, possible = nearest_allowed(wanted, planes, LIMIT)
+    u, given, offset = cp.Variable(2), cp.Parameter(2), cp.Parameter(conditions)
+    normal = cp.Parameter((conditions, 2))
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(u - given)), [normal @ u >= offset, cp.norm(u) <= LIMIT])
+    # The action is shortened to the limit first: it is what would be executed.
+    wanted = wanted * np.minimum(1, LIMIT / np.linalg.norm(wanted, axis=1))[:, None]
+    for row in range(len(wanted)):
+        given.value, normal.value, offset.value = wanted[row], planes.normal[row], planes.offset[row]
+        problem.solve(solver=cp.CLARABEL)
+        assert (problem.status in ("optimal", "optimal_inaccurate")) == bool(possible[row])
+        if possible[row]:
+            np.testing.assert_allclose(found[row], u.value, atol=2e-3)
+
+
+def test_what_is_allowed_stays_and_what_helps_is_taken():
+    wanted, planes = random_planes(7, 2000, 5)
+    found, possible = nearest_allowed(wanted, planes, LIMIT)
+    short = wanted * np.minimum(1, LIMIT / np.linalg.norm(wanted, axis=1))[:, None]
+    allowed = violation(short, planes) <= 0
+    assert 50 < allowed.sum()
+    np.testing.assert_allclose(found[allowed], short[allowed], rtol=1e-12)
+    assert 50 < possible.sum() < 1950
+    assert violation(found[possible], planes_of(planes, possible)).max() <= TOLERANCE
+    assert np.linalg.norm(found, axis=1).max() <= LIMIT * (1 + 1e-9)
+    # Where nothing is allowed, no action tried at random does much better than the one taken.
+    hopeless = planes_of(planes, ~possible)
+    taken = violation(found[~possible], hopeless)
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        angle, size = rng.uniform(0, 2 * np.pi, len(taken)), LIMIT * np.sqrt(rng.random(len(taken)))
+        tried = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        assert (violation(tried, hopeless) > 0).all()
+        better = taken - violation(tried, hopeless)
+        assert np.quantile(better, 0.5) <= 0
+
+
+def planes_of(planes: HalfPlanes, rows: np.ndarray) -> HalfPlanes:
+    return HalfPlanes(normal=planes.normal[rows], offset=planes.offset[rows])
+
+
+def test_absent_conditions_and_no_limit():
+    wanted, planes = random_planes(3, 40, 3)
+    gone = replace(planes, offset=np.where(np.arange(3) == 1, planes.offset, -np.inf))
+    alone = HalfPlanes(normal=planes.normal[:, 1:2], offset=planes.offset[:, 1:2])
+    for limit in (LIMIT, np.inf):
+        ours, theirs = nearest_allowed(wanted, gone, limit), nearest_allowed(wanted, alone, limit)
+        np.testing.assert_array_equal(ours[1], theirs[1])
+        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-9)
+    free, possible = nearest_allowed(wanted, replace(planes, offset=np.full((40, 3), -np.inf)), np.inf)
+    np.testing.assert_array_equal(free, wanted)
+    assert possible.all()
+
+
+def test_jax_agrees():
+    wanted, planes = random_planes(5, 200, 4)
+    ours, possible = nearest_allowed(wanted, planes, LIMIT)
+    cast = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), planes)
+    theirs, there = jax.jit(lambda u, p: nearest_allowed(u, p, LIMIT))(jnp.asarray(wanted, jnp.float32), cast)
+    same = np.asarray(there) == possible
+    assert same.mean() > 0.99
+    np.testing.assert_allclose(np.asarray(theirs)[same & possible], ours[same & possible], atol=2e-2)
+
+
+SPEC = SceneSpec(num_agents=3, num_obstacles=2)
+
+
+def test_every_constraint_is_kept_where_it_can_be():
+    rng = np.random.default_rng(0)
+    angle, far = rng.uniform(0, 2 * np.pi, (60, 3)), rng.uniform(8.1, 20, (60, 3))
+    state = scene_state(
+        SPEC,
+        far[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+        rng.normal(0, 6, (60, 3, 2)),
+        obstacle=np.array([[0.0, 0.0], [40.0, 0.0]]) + np.zeros((60, 2, 2)),
+        obstacle_present=np.ones((60, 2), bool),
+    )
+    s = situations_of_state(state)
+    wanted = rng.normal(0, 8, (180, 2))
+    for name in ("barrier", "disc", "polygon", "diamond", "roll-out"):
+        constraint = make_constraint(ConstraintConfig(name=name), SPEC)
+        safe, possible = safe_actions(constraint, s, wanted, SPEC, SPEC)
+        e = encounters(s, SPEC)
+        slack = constraint.slack(e, safe).min(axis=1)
+        assert possible.mean() > 0.7, name
+        assert slack[possible].min() >= -2 * TOLERANCE, name
+        assert constraint.slack(e, wanted).min() < -0.1, name
+
+
+def headlong(state, params, key=None):
+    """Full throttle towards the goal."""
+    apart = state.goal[:, None] - state.position
+    return 10.0 * apart / jnp.maximum(jnp.linalg.norm(apart, axis=-1, keepdims=True), 1e-6)
+
+
+def test_nobody_touches_in_physics():
+    env = SwarmEnv(SPEC, engine="native", horizon=40)
+    scenes = 8
+    rng = np.random.default_rng(1)
+    start = scene_state(
+        SPEC,
+        np.stack([rng.uniform(-3, 3, (scenes, 3)) - 25, np.array([-6.0, 0.0, 6.0]) + np.zeros((scenes, 3))], axis=-1),
+        goal=np.full((scenes, 2), [30.0, 0.0]),
+        obstacle=np.stack([np.zeros((scenes, 2)), np.array([0.0, 30.0]) + np.zeros((scenes, 2))], axis=-1),
+        obstacle_present=np.array([True, False]) & np.ones((scenes, 2), bool),
+        agent_present=np.arange(3) < np.where(np.arange(scenes) % 2, 3, 1)[:, None],
+    )
+    traced = []
+
+    def policy(state, params, key=None):
+        traced.append(1)
+        return headlong(state, params, key)
+
+    filtered = make_filtered(policy, Barrier(kinematics=SPEC, margin=0.05), SPEC, SPEC)
+    keys = scene_keys(0, np.arange(scenes))
+    run = make_rollout(env, filtered, steps=40)
+    recording = jax.device_get(run(None, start, keys))
+    run(None, start, keys)
+    assert len(traced) == 1  # compiled once
+    bare = jax.device_get(make_rollout(env, headlong, steps=40)(None, start, keys))
+    touched = [int(x.contacts.obstacle_states.sum()) for x in (recording, bare)]
+    assert touched[0] == 0
+    assert touched[1] > 0
+    assert recording.contacts.agent_states.sum() == 0
+    here = np.asarray(start.agent_present)
+    assert recording.position[:, -1, 0, 0].min() > -15  # it goes on, where it may
+    np.testing.assert_array_equal(recording.position[:, -1][~here], recording.position[:, 0][~here])
+
+
+def test_absent_agents_keep_their_action():
+    state = scene_state(
+        SPEC,
+        np.array([[[9.0, 0], [9.5, 0], [0, 0]]]),
+        np.array([[[-8.0, 0], [0, 0], [0, 0]]]),
+        obstacle=np.zeros((1, 2, 2)),
+        obstacle_present=np.array([[True, False]]),
+        agent_present=np.array([[True, False, False]]),
+    )
+    wanted = jnp.asarray([[[-10.0, 0], [3.0, 40.0], [1.0, 1.0]]])
+    filtered = jax.jit(make_filtered(lambda *_: wanted, Disc(kinematics=SPEC), SPEC, SPEC))(state, None)
+    np.testing.assert_array_equal(filtered[0, 1:], wanted[0, 1:])
+    assert float(filtered[0, 0, 0]) > 0  # 1 m away at 8 m/s: brakes
