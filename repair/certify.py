@@ -68,7 +68,9 @@ class Certificate:
     unavoidable: float
     """In every state the least outward acceleration is above the limit: no action keeps the barrier."""
     harmless: float
-    """Part of `proven`: in these states every action keeps it."""
+    """Share of states in which every action keeps it, by quadrature; proven where the cells are fine enough."""
+    contested: float
+    """Share of states in which it is up to the policy: neither harmless nor unavoidable, by quadrature."""
     counter_examples: Situations
     """States in which an action would keep the barrier and the policy's does not, verified one by one in float64."""
     slack: Float[Values, " X"]
@@ -78,9 +80,9 @@ class Certificate:
     """Cells looked at."""
 
     @property
-    def contested(self) -> float:
-        """Share in which the policy decides: neither unavoidable nor harmless."""
-        return 1 - self.unavoidable - self.harmless
+    def kept(self) -> float:
+        """Proven part of the contested states, at least: as if all that is open or refuted were contested."""
+        return max(0.0, 1 - (self.refuted + self.undecided) / self.contested) if self.contested else 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,7 +232,7 @@ def certify(
     rng = np.random.default_rng(effort.seed)
     queue = deque([ring.start()])
     whole = float(ring.volume(*queue[0]).sum())
-    volume: dict[str, float] = dict.fromkeys(("proven", "refuted", "undecided", "unavoidable", "harmless"), 0.0)
+    volume: dict[str, float] = dict.fromkeys(("proven", "refuted", "undecided", "unavoidable"), 0.0)
     found = _Found(effort.examples)
     seen = 0
     while queue:
@@ -252,11 +254,14 @@ def certify(
                 low, high = np.concatenate([last[0], low]), np.concatenate([last[1], high])
             queue.append((low, high))
         if update is not None:
-            done = sum(volume[name] for name in ("proven", "refuted", "undecided", "unavoidable")) / whole
+            done = sum(volume.values()) / whole
             update(int(1000 * done), 1000, f"{volume['proven'] / whole:.1%} proven, {len(found)} counter-examples")
+    harmless, hopeless = _without_policy(ring)
     points, worst = found.taken(ring.range.shape[1])
     return Certificate(
         **{name: amount / whole for name, amount in volume.items()},
+        harmless=harmless,
+        contested=1 - harmless - hopeless,
         counter_examples=ring.situations(points),
         slack=worst,
         seconds=time.monotonic() - started,
@@ -306,7 +311,6 @@ def _looked_at(
     amount = ring.volume(low, high)
     decided = {
         "proven": proven,
-        "harmless": harmless,
         "unavoidable": unavoidable,
         "refuted": end & (violated | bad),
         "undecided": end & ~(violated | bad),
@@ -318,6 +322,19 @@ def _looked_at(
     first[rows, axis] = second[rows, axis] = middle[rows, axis]
     halves = ring.within(np.concatenate([low, second]), np.concatenate([first, high]))
     return {name: float(amount[mask].sum()) for name, mask in decided.items()}, halves
+
+
+def _without_policy(ring: Ring, parts: int = 1000) -> tuple[float, float]:
+    """Shares of the ring in which every action keeps the barrier and in which none does, by the midpoint rule."""
+    motion, (near, far) = ring.barrier.kinematics, ring.range[:, 0]
+    middles = (np.arange(parts) + 0.5) / parts
+    d = np.repeat(near + middles * (far - near), parts)
+    s = np.tile(motion.max_speed * (2 * middles - 1), parts)
+    weight = d * np.sqrt(motion.max_speed**2 - s**2)
+    least = ring.least(d, s)
+    harmless = (least <= -motion.max_acceleration) | (s + motion.dt * least <= -motion.max_speed)
+    weight /= weight.sum()
+    return float(weight[harmless].sum()), float(weight[least > motion.max_acceleration].sum())
 
 
 def _slack(params: Params, scales: Scales, ring: Ring, points: Values, *, normalise: bool) -> Float[Values, " P"]:

@@ -103,7 +103,7 @@ class Descent:
             value = 0.5 * deviation.mean() + config.price * missed.mean()
             return value, {"deviation": deviation.mean(), "missed": missed.mean()}
 
-        def run(carry: Any, params: Params, pool: Lessons, count: Array, key: jax.Array, total: int) -> Any:
+        def run(carry: Any, params: Params, pool: Lessons, count: Array, key: jax.Array, total: Array) -> Any:
             def one(carry: Any, step: Array) -> Any:
                 leaves, state, mean = carry
                 chosen = jax.random.randint(jax.random.fold_in(key, step), (config.batch,), 0, count)

@@ -15,8 +15,9 @@ def as_executed(planes: HalfPlanes, limit: float) -> HalfPlanes:
     that cone is two half-planes more. For b <= 0, n . u >= b is enough. An offset beyond the limit leaves no action; it
     is taken as the limit, and no slack of `planes` themselves will then be positive. C conditions become 3 C.
 
-    The speed limit shortens the velocity after the step: it never speeds up an approach, so a barrier that holds for
-    the clipped acceleration holds for the executed one; positions are checked after the fact (`repair.verify`).
+    The speed limit shortens the velocity after the step: it never speeds up an approach, so where an agent is still
+    closing after the step, a barrier that holds for the clipped acceleration holds for the executed one; the rest is
+    checked after the fact (`repair.verify`).
     """
     n, b = planes.normal, planes.offset
     xp = n.__array_namespace__()

@@ -102,16 +102,16 @@ class _Work:
         situations, _ = decisions(acted)
         if not len(situations):
             raise RepairError("no agent is present in any scene", round=number)
-        found = screen(self.must, situations, self.act(params, situations), self.bodies, self.kinematics)
-        return (
-            situations,
-            found,
-            contacts(acted)
-            | {
-                "violated": float(found.violated.mean()),
-                "avoidable": float(found.avoidable.mean()),
-            },
-        )
+        action, velocity = self.act(params, situations), situations.own[:, 2:]
+        found = screen(self.must, situations, action, self.bodies, self.kinematics)
+        before = executed(velocity, self.act(self.origin, situations), self.kinematics)
+        change = executed(velocity, action, self.kinematics) - before
+        row = {
+            "violated": float(found.violated.mean()),
+            "avoidable": float(found.avoidable.mean()),
+            "changed": float(np.sqrt(np.mean(np.sum(change**2, axis=1)))),
+        }
+        return situations, found, contacts(acted) | row
 
     def lessons(self, situations: Situations, params: Params, number: int) -> Lessons:
         """The decisions of a round that are worth learning from: those that the filter would change, those near a body

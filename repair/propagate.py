@@ -5,7 +5,7 @@ and of its senders side by side. So what an agent's edge functions and its node 
 
 Forward, every neuron is an affine form in z with an error of its own, beside an interval; that bounds what enters each
 ReLU. Backward from the output, each ReLU is replaced by a line above or below it (Zhang et al. 2018, CROWN). Bounding
-every layer backward as well takes 30 times as long on preset thesis-ch5 and gains 5% for sets of 0.2 m and m/s.
+every layer backward as well takes 30 times as long on preset thesis-ch5 and gains 10% for sets of 0.2 m and m/s.
 """
 
 from dataclasses import dataclass

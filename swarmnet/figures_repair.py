@@ -84,7 +84,25 @@ def make_repair_figures(run: str | Path) -> list[FigureFile]:
         return []
     file = Path(run) / "figures" / "repair_rounds.svg"
     write_whole(file, svg(repair_rounds(rounds)))
+    beside = Path(run) / "figures" / "repair_pareto.svg"
+    first = rounds[0]
+    goal = {"distance to the goal / before": "goal_distance"} if first.get("goal_distance") else {}
+    costs = {"change of actions [m/s²]": "changed", **goal}
+    points = [
+        (
+            f"round {row['round']}",
+            {"control steps with a contact [%]": 100 * row["contact_steps"]}
+            | {name: row[key] / (first[key] if key == "goal_distance" else 1) for name, key in costs.items()},
+        )
+        for row in rounds
+    ]
+    write_whole(beside, svg(pareto(points, "control steps with a contact [%]", list(costs))))
     return [
+        FigureFile(
+            beside, "What fewer contacts cost",
+            "Every point is a round's policy in scenes that it had not learned from: contacts over the root mean "
+            "square change of its executed actions in its own states, and over where it ends up.",
+        ),
         FigureFile(
             file, "Repair, round by round",
             "Every round acts in scenes of its own and learns from them afterwards, so each point is of scenes that "

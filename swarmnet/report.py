@@ -34,6 +34,7 @@ from swarmnet.report_tables import (
     plain_words,
     ppo_table,
     prediction_tables,
+    repair_table,
     shown,
     worst_table,
 )
@@ -66,6 +67,7 @@ def write_report(run: str | Path) -> Path:
                 _video(video, first=not k) for k, video in enumerate(find_videos(run))
             ),
             **ppo_table(facts),
+            **repair_table(facts),
             **prediction_tables(facts.evaluation, facts.model),
             **collision_cells(facts.evaluation),
             **collective_table(facts.evaluation),

@@ -1,9 +1,12 @@
 """Numbers and tables of the report, as HTML: what a run's evaluation.json holds of policy and reference."""
 
+import json
 from html import escape
 
 from envs.collective import UNITS
+from repair.verify import clopper_pearson
 from rl.config import MODES
+from swarm_mjcf.errors import SwarmError
 from swarmnet.figures_rl import WINDOW, final_return, smoothed
 from swarmnet.report_facts import Facts
 
@@ -72,6 +75,48 @@ def ppo_table(facts: Facts) -> dict[str, str]:
         f"<tr><th>{escape(name)}</th><td>{escape(plain_words(value))}</td></tr>" for name, value in known.items()
     )
     return {"improved": f"{start} {mode_of(ppo).capitalize()}: {kept}.{gained}", "ppo": f"<tbody>{cells}</tbody>"}
+
+
+def repair_table(facts: Facts) -> dict[str, str]:
+    """What a repair guarantees, in plain words, and each of its rounds."""
+    path = facts.run / "repair.json"
+    if not path.exists():
+        return {}
+    try:
+        found = json.loads(path.read_text())
+        rounds, v, how = found["rounds"], found["verification"], found["settings"]
+        rule = how["constraint"]
+        judged = next(row for row in rounds if row["round"] == found["best_round"])
+    except (ValueError, KeyError, StopIteration) as error:
+        raise SwarmError(f"{path}: is damaged; `swarmnet repair` writes it anew") from error
+    left = v["avoidable"]
+    hold = "all of them keep it" if not left else f"{left} of them still break it"
+    touched = round(judged["trajectories"] * judged["scenes"])
+    _, most = clopper_pearson(touched, judged["scenes"])
+    free = ", ".join(f"<code>{escape(pattern)}</code>" for pattern in how["free"])
+    words = (
+        f"Only {free} were changed, so that the {escape(rule['name'])} (margin {rule['margin']:g} m, "
+        f"{100 * rule['share']:g}% of the brakes) holds. <b>What is guaranteed:</b> of {v['rows']} decisions that "
+        f"broke it without need while the policy was repaired, {hold} now, checked in 64-bit arithmetic with the saved "
+        "weights, limits and integrator. <b>What is evidence:</b> in "
+        f"{judged['scenes']} scenes that it did not learn from, {touched} had a contact; with 95% confidence at most "
+        f"{100 * most:.2g}% of scenes like these have one. <b>What is not claimed:</b> anything about other scenes. "
+        f"Status: {escape(found['status'])}."
+    )
+    columns = {
+        "round": ("round", 1), "contact_steps": ("contact steps [%]", 100),
+        "contact_steps_agent": ("of agents [%]", 100), "contact_steps_obstacle": ("of obstacles [%]", 100),
+        "trajectories": ("scenes with one [%]", 100),
+        "avoidable": ("avoidable violations [% of decisions]", 100), "goal_distance": ("goal distance [m]", 1),
+        "changed": ("change of actions [m/s²]", 1),
+    }  # fmt: skip
+    shown = {key: value for key, value in columns.items() if key in rounds[0]}
+    head = "".join(f"<th>{title}</th>" for title, _ in shown.values())
+    body = "".join(
+        "<tr>" + "".join(f"<td>{number(factor * row[key])}</td>" for key, (_, factor) in shown.items()) + "</tr>"
+        for row in rounds
+    )
+    return {"repaired": words, "repair": f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>"}
 
 
 def mode_of(ppo: dict) -> str:

@@ -138,9 +138,9 @@ def test_what_cannot_be_encoded_is_named():
         return Model(tiny(name), scales(), INTEGRATOR, {}, {"preset": name})
 
     assert check_encodable(model("thesis-ch5")) == tiny("thesis-ch5")
-    with pytest.raises(NotEncodable, match="preset best cannot be repaired.*frame"):
+    with pytest.raises(NotEncodable, match=r"preset best cannot be repaired.*frame"):
         check_encodable(model("best"))
-    with pytest.raises(NotEncodable, match="thesis-ch3.*no acceleration"):
+    with pytest.raises(NotEncodable, match=r"thesis-ch3.*no acceleration"):
         check_encodable(model("thesis-ch3"))
 
 

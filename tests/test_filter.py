@@ -38,7 +38,7 @@ def violation(u: np.ndarray, planes: HalfPlanes) -> np.ndarray:
 @pytest.mark.parametrize("conditions", [1, 2, 3, 6])
 def test_nearest_is_the_solver_s(conditions):
     wanted, planes = random_planes(conditions, 30, conditions)
-    found, possible = nearest_allowed(wanted, planes, LIMIT)
+    found, possible = map(np.asarray, nearest_allowed(wanted, planes, LIMIT))
     u, given, offset = cp.Variable(2), cp.Parameter(2), cp.Parameter(conditions)
     normal = cp.Parameter((conditions, 2))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(u - given)), [normal @ u >= offset, cp.norm(u) <= LIMIT])
@@ -54,10 +54,10 @@ def test_nearest_is_the_solver_s(conditions):
 
 def test_what_is_allowed_stays_and_what_helps_is_taken():
     wanted, planes = random_planes(7, 2000, 5)
-    found, possible = nearest_allowed(wanted, planes, LIMIT)
+    found, possible = map(np.asarray, nearest_allowed(wanted, planes, LIMIT))
     short = wanted * np.minimum(1, LIMIT / np.linalg.norm(wanted, axis=1))[:, None]
     allowed = violation(short, planes) <= 0
-    assert 50 < allowed.sum()
+    assert allowed.sum() > 50
     np.testing.assert_allclose(found[allowed], short[allowed], rtol=1e-12)
     assert 50 < possible.sum() < 1950
     assert violation(found[possible], planes_of(planes, possible)).max() <= TOLERANCE

@@ -59,7 +59,7 @@ def run(config: Certify) -> int:
 
 def shares(certificate: Certificate) -> dict[str, float]:
     """What of the ring is known, by name."""
-    names = ("proven", "refuted", "undecided", "unavoidable", "harmless", "contested")
+    names = ("proven", "refuted", "undecided", "unavoidable", "harmless", "contested", "kept")
     return {name: getattr(certificate, name) for name in names}
 
 
@@ -86,19 +86,17 @@ def unpacked(path: Path) -> Situations:
 def words(certificate: Certificate, ring: Ring, examples: int = 2) -> str:
     """The certificate for people."""
     c, far = certificate, ring.reach + ring.region.depth
-    decides = c.contested
     lines = [
         f"Of all positions {ring.reach:g} to {far:g} m from the obstacle's centre and all velocities up to "
         f"{ring.barrier.kinematics.max_speed:g} m/s, by volume:",
-        f"  {c.proven:8.3%} proven: the executed action keeps the barrier in every state "
-        f"({c.harmless:.3%} where any action does, {c.proven - c.harmless:.3%} by the policy's)",
+        f"  {c.proven:8.3%} proven: the executed action keeps the barrier in every state",
         f"  {c.refuted:8.3%} refuted: it does not",
         f"  {c.undecided:8.3%} undecided",
         f"  {c.unavoidable:8.3%} unavoidable: no action within the limit keeps it",
+        f"In {c.harmless:.3%} every action keeps it. Of the {c.contested:.3%} in which it is up to the policy, "
+        f"{c.kept:.1%} or more are proven.",
+        f"{c.cells} cells in {c.seconds:.1f} s; {len(c.slack)} counter-examples kept.",
     ]
-    if decides > 0:
-        lines.append(f"Where the policy decides ({decides:.3%}), {(c.proven - c.harmless) / decides:.1%} is proven.")
-    lines.append(f"{c.cells} cells in {c.seconds:.1f} s; {len(c.slack)} counter-examples kept.")
     for row in range(min(examples, len(c.slack))):
         own = np.asarray(c.counter_examples.own[row])
         away = own[:2] - np.asarray(ring.region.obstacle)
