@@ -85,9 +85,11 @@ class LoopConfig:
     """Weights that may change, as patterns over their paths."""
     polish: tuple[str, ...] = ("node/*", "readout/*")
     """Weights that the quadratic programs at the end may change; none: they are left out."""
-    method: Literal["distil", "relax"] = "distil"
-    """How a round changes the weights. distil: Adam towards the filter's actions, and quadratic programs at the end for
-    what still breaks the constraint. relax: quadratic programs alone, for some thousands of free weights at most."""
+    method: Literal["distil", "relax", "thesis", "last-layer"] = "distil"
+    """How the weights change. distil: Adam towards the filter's actions, and quadratic programs at the end for what
+    still breaks the constraint. relax: quadratic programs alone, for some thousands of free weights at most. thesis:
+    mixed-integer programs, a layer at a time, on states taken once. last-layer: branch and bound over the sides on
+    which the last layer passes true discs, on states taken once."""
     targets: Literal["filter", "own"] = "filter"
     """Which actions it learns or holds on to: the policy's first ones as a filter would let them through, or as they
     were (the penalty method)."""
@@ -114,17 +116,31 @@ class LoopConfig:
     """Decisions that the quadratic programs leave as they are."""
     price: float = 100.0
     """Of a missed condition in the quadratic programs (`repair.relax`)."""
+    agents: bool = True
+    """thesis, last-layer: keep agents from each other too; the thesis keeps them from obstacles alone."""
+    states: int = 1000
+    """thesis, last-layer: states of the roll-outs that the program is about, each of all its agents."""
+    layers: tuple[str, ...] = ("readout/layer0",)
+    """thesis: layers that take turns in being free; the thesis has results for the last one."""
+    box: float = 0.3
+    """thesis: how far a weight of the free layer may go."""
+    solver_seconds: float = 120.0
+    """thesis, last-layer: time for each program [s]."""
     descent: DescentConfig = field(default_factory=DescentConfig)
 
     def __post_init__(self) -> None:
-        if self.method not in ("distil", "relax"):
-            raise SpecError("method", self.method, "distil or relax")
+        methods = ("distil", "relax", "thesis", "last-layer")
+        if self.method not in methods:
+            raise SpecError("method", self.method, "one of " + ", ".join(methods))
+        for name in ("box", "solver_seconds"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise SpecError(name, getattr(self, name), "a finite number of at least 0")
         if self.targets not in ("filter", "own"):
             raise SpecError("targets", self.targets, "filter or own")
         for name, low in (("rounds", 0), ("scenes", 1), ("steps", 1), ("seed", 0), ("lessons", 1), ("pool", 1)):
             if getattr(self, name) < low:
                 raise SpecError(name, getattr(self, name), f"at least {low}")
-        for name in ("hard", "anchors"):
+        for name in ("hard", "anchors", "states"):
             if getattr(self, name) < 1:
                 raise SpecError(name, getattr(self, name), "at least 1")
         if not 0 <= self.reserve_margin < float("inf"):

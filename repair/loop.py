@@ -31,6 +31,7 @@ from repair.filter import safe_actions
 from repair.limits import executed
 from repair.linearise import FreeWeights, Linearised
 from repair.network import Situations, actions, check_encodable, concatenate
+from repair.once import by_branches, by_programs, mendable
 from repair.relax import Problem, Relaxation, relax
 from repair.screen import Acted, Perform, Screened, decisions, screen
 from repair.verify import Verification, verify
@@ -52,6 +53,8 @@ class Repaired:
     rows: Situations
     """Those rows."""
     seconds: float
+    gap: float | None = None
+    """Relative gap that the solver of a method of one step left."""
     history: list[dict] = field(default_factory=list)
     """Of every round: contacts of its scenes, violations among its decisions, deviation, seconds."""
 
@@ -217,6 +220,8 @@ def repair(
         )
     params = work.origin
     tell = progress or (lambda done, total, found: None)
+    if config.method in ("thesis", "last-layer"):
+        return _once(work, tell, began)
     for number in range(config.rounds + 1):
         work.candidates.append(params)
         kept = work.load(number) if number < config.rounds else None
@@ -253,7 +258,31 @@ def repair(
         params, model.scales, rows, work.must, bodies, work.kinematics, normalise=work.normalise, before=work.origin
     )
     status = Status.FEASIBLE if verification.holds_as_executed else Status.ELASTIC
-    return Repaired(params, status, best, verification, rows, time.perf_counter() - began, work.history)
+    return Repaired(params, status, best, verification, rows, time.perf_counter() - began, None, work.history)
+
+
+def _once(work: _Work, tell: Progress, began: float) -> Repaired:
+    """A method that takes its states from round 0 and solves one program."""
+    config, model = work.config, work.model
+    situations, _, row = work.judged(work.origin, 0)
+    work.history.append(row | {"round": 0, "seconds": time.perf_counter() - began})
+    tell(1, 2, work.history[-1])
+    rng = np.random.default_rng(config.seed)
+    agents = max(1, round(len(situations) / (config.scenes * config.steps)))
+    chosen = np.sort(rng.permutation(len(situations))[: config.states * agents])
+    rows = mendable(model, work.normalise, work.must, situations.take(chosen), work.bodies)
+    method = by_programs if config.method == "thesis" else by_branches
+    params, gap = method(model, work.normalise, config, work.must, rows, work.bodies)
+    seconds = time.perf_counter() - began
+    _, _, row = work.judged(params, 1)
+    work.history.append(row | {"round": 1, "seconds": time.perf_counter() - began})
+    tell(2, 2, work.history[-1])
+    found = verify(
+        params, model.scales, rows, work.must, work.bodies, work.kinematics, normalise=work.normalise,
+        before=work.origin,
+    )  # fmt: skip
+    status = Status.FEASIBLE if found.holds_as_executed else Status.ELASTIC
+    return Repaired(params, status, 1, found, rows, seconds, gap, work.history)
 
 
 def _within(tell: Progress, number: int, rounds: int, row: dict, done: int, total: int, seen: dict) -> None:

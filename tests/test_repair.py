@@ -273,7 +273,7 @@ def drift(rng: np.random.Generator, scenes: int = 16, rows: int = 6, params=None
     _, _, graph = learning.random_swarm(0, COUNTS, batch=scenes)
     graph = jax.tree.map(lambda x: np.array(x), graph)
     nodes = np.zeros((scenes, rows + 1, 4, 4), np.float32)
-    angle = rng.uniform(0, 2 * np.pi, (scenes, 2)) + [0, np.pi]
+    angle = [*rng.uniform(0, 2 * np.pi, (scenes, 2)), 0, np.pi]
     outward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     nodes[:, :, 0, :2] = 15 * outward[:, None, 0]
     nodes[:, 0, 2:, :2] = rng.uniform(7, 12, (scenes, 2, 1)) * outward
@@ -405,3 +405,23 @@ def test_a_descent_that_diverges_says_so_and_changes_nothing():
 def test_settings_out_of_range_are_named(make, field):
     with pytest.raises(SpecError, match=field):
         make()
+
+
+@pytest.mark.parametrize(("method", "name"), [("thesis", "diamond"), ("thesis", "polygon"), ("last-layer", "disc")])
+def test_methods_of_one_step_mend_the_states_they_took(method, name):
+    m = model()
+    constraint = ConstraintConfig(name=name, margin=0.5)
+    how = LoopConfig(method=method, constraint=constraint, scenes=16, steps=6, states=60, box=2.0, solver_seconds=20.0)
+    found = repair(m, how, BODIES, performing(m))
+    assert found.verification.mended > 0
+    assert found.verification.introduced == 0
+    assert [row["round"] for row in found.history] == [0, 1]
+    assert found.gap is not None
+    for path, before, after in zip(paths_of(m.params), *map(jax.tree.leaves, (m.params, found.params)), strict=True):
+        assert path.startswith("readout/") or np.array_equal(before, after)
+
+
+def test_the_last_layer_wants_discs():
+    m = model()
+    with pytest.raises(SpecError, match="disc with method last-layer"):
+        repair(m, LoopConfig(method="last-layer", scenes=16, steps=6), BODIES, performing(m))

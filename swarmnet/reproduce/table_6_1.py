@@ -6,12 +6,10 @@ OUT/PROFILE/repaired/ROW/seed-S; the cells judge it in the thesis's scenes (5 ag
 
 import json
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -22,27 +20,17 @@ from envs.trajectories import Trajectories
 from gnn.checkpoint import Model, load_model
 from gnn.config import TrainConfig
 from gnn.decode import make_policy
-from gnn.family import Params
 from gnn.train import split, train
 from gnn.windows import Dataset, windows
-from repair.branch import branch_readout
 from repair.config import ConstraintConfig, DescentConfig, LoopConfig
-from repair.constraints.constraint import Constraint
-from repair.constraints.diamond import Diamond
 from repair.constraints.disc import Disc
 from repair.constraints.registry import make_constraint
 from repair.encounters import encounters
-from repair.errors import Status
 from repair.filter import make_filtered, safe_actions
-from repair.layerwise import layerwise
 from repair.limits import executed
 from repair.loop import Repaired, repair
-from repair.network import Situations, actions
-from repair.problem import Problem
+from repair.network import actions
 from repair.screen import Acted, decisions, least, screen
-from repair.solve import Limits
-from repair.verify import verify
-from swarm_mjcf.spec import SceneSpec
 from swarmnet.acting import make_perform
 from swarmnet.commands.repair import SCENES, keep, note
 from swarmnet.commands.train import note as training_note
@@ -68,14 +56,17 @@ TESTED = 1000
 MUST = ConstraintConfig()
 """What ours has to keep: the braking barrier, of obstacles and of agents."""
 EDGES, NODES = ("edge/obstacle/layer2/*", "edge/agent/layer2/*"), ("node/*", "readout/*")
-TRAIN_STATES = 1000
-"""States of the thesis's program, of 5 agents each."""
 
 IMITATED, REPLICA, READOUT, EDGE, EDGE_NODE = (
     "imitation", "thesis replica", "last layer, true disc", "edge functions", "edge + node",
 )  # fmt: skip
 LOOP, PENALTY, FILTER, BOTH = "counter-example loop", "Adam penalty", "filter", "repaired + filter"
 LOOPS: dict[str, LoopConfig] = {
+    # As in chapter 6: 1000 states, obstacles alone, an L1 diamond, L1 deviation.
+    REPLICA: LoopConfig(
+        method="thesis", constraint=ConstraintConfig(name="diamond"), agents=False, scenes=100, rounds=1
+    ),
+    READOUT: LoopConfig(method="last-layer", constraint=ConstraintConfig(name="disc"), scenes=100),
     EDGE: LoopConfig(method="relax", free=EDGES, polish=(), rounds=4),
     EDGE_NODE: LoopConfig(method="relax", free=(*EDGES, *NODES), polish=(), rounds=4),
     LOOP: LoopConfig(),
@@ -153,20 +144,20 @@ class Policies:
         return load_model(place / "checkpoints"), json.loads((place / FACTS).read_text())
 
     def _repaired(self, row: str, model: Model) -> tuple[Repaired, Facts, LoopConfig]:
-        how = replace(LOOPS.get(row, LoopConfig(rounds=0)), seed=self.seed)
+        how = replace(LOOPS[row], seed=self.seed)
         if self.effort.profile == "quick":
             how = replace(how, rounds=min(how.rounds, 2), scenes=128, descent=replace(how.descent, steps=1000))
-        # Ours acts in scenes like the demonstrations', the thesis's methods in the thesis's.
-        world = (LEARNED if row in LOOPS else THESIS).world()
+        # Ours acts in scenes like the demonstrations', the methods of one step in the thesis's.
+        world = (THESIS if row in (REPLICA, READOUT) else LEARNED).world()
         perform = make_perform(model, world, scenes=how.scenes, steps=how.steps, seed=SCENES + how.seed)
-        if row in (REPLICA, READOUT):
-            return *(_replica if row == REPLICA else _readout)(model, perform(model.params, 0), world.scene), how
 
         def report(done: int, total: int, found: dict) -> None:
             self.progress(done, total, f"{row}: {note(found)}")
 
         found = repair(model, how, world.scene, perform, folder=self.place(row) / "rounds", progress=report)
         facts = {ROWS_GIVEN: found.verification.rows, ROWS_LEFT: found.verification.avoidable, SECONDS: found.seconds}
+        if found.gap is not None:
+            facts[GAP] = 100 * found.gap
         return found, facts, how
 
     def acted(self, row: str, model: Model, world: World, scenes: int, seed: int) -> Acted:
@@ -181,65 +172,6 @@ class Policies:
 
 
 FACTS = "facts.json"
-
-
-def _train_states(acted: Acted, states: int) -> Situations:
-    """The thesis's train set: states of the policy's own roll-outs, ten of each of 100 trajectories."""
-    first = jax.tree.map(lambda x: x[:100], acted)
-    everyone, where = decisions(first)
-    return everyone.take(np.isin(where[:, 1], np.linspace(0, STEPS - 1, states // 100).astype(int)))
-
-
-def _replica(model: Model, acted: Acted, bodies: SceneSpec) -> tuple[Repaired, Facts]:
-    """Chapter 6 as it is: the last layer free, L1 diamonds around obstacles on the next position of 1000 states, least
-    L1 distance from the original actions, by HiGHS. Violations are elastic: where states are inside, nothing helps."""
-    began, states = time.perf_counter(), _train_states(acted, TRAIN_STATES)
-    constraint = Diamond(kinematics=model.integrator)
-    states = _mendable(model, constraint, states, bodies)
-    targets = np.asarray(actions(model.params, model.scales, states))
-    problem = Problem(
-        scales=model.scales, situations=states, targets=targets, constraint=constraint, bodies=bodies, agents=False
-    )
-    limits = Limits(seconds=PATIENCE, threads=1)
-    found = layerwise(model.params, problem, radius=BOX, price=1.0, layers=["readout/layer0"], rounds=1, limits=limits)
-    return _of_rows(model, found.params, states, constraint, bodies, began, found.history[-1].gap)
-
-
-def _readout(model: Model, acted: Acted, bodies: SceneSpec) -> tuple[Repaired, Facts]:
-    """The last layer free, true discs of obstacles and agents on the next position, least squares."""
-    began, states = time.perf_counter(), _train_states(acted, TRAIN_STATES)
-    disc = Disc(kinematics=model.integrator)
-    mendable = _mendable(model, disc, states, bodies)
-    e = encounters(mendable, bodies)
-    found = branch_readout(model.params, model.scales, states, mendable, e, disc, seconds=PATIENCE, price=1e4)
-    params = model.params
-    if found.kernel is not None and found.bias is not None:
-        params = model.params | {"readout": {"layer0": {"kernel": found.kernel, "bias": found.bias}}}
-    return _of_rows(model, params, states, disc, bodies, began, found.gap)
-
-
-def _mendable(model: Model, constraint: Constraint, states: Situations, bodies: SceneSpec) -> Situations:
-    """Without those that break the constraint whatever they do within the limits: no weights can help them."""
-    now = actions(model.params, model.scales, states)
-    judged = screen(constraint, states, now, bodies, model.integrator)
-    return states.take(~judged.violated | judged.avoidable)
-
-
-PATIENCE = 120.0
-"""Of a solver [s]."""
-BOX = 0.3
-"""Of the thesis's free layer: how far a weight may go."""
-
-
-def _of_rows(
-    model: Model, params: Params, states: Situations, constraint: Constraint, bodies: SceneSpec, began: float,
-    gap: float | None,
-) -> tuple[Repaired, Facts]:  # fmt: skip
-    v = verify(params, model.scales, states, constraint, bodies, model.integrator, before=model.params)
-    seconds = time.perf_counter() - began
-    status = Status.FEASIBLE if v.holds_as_executed else Status.ELASTIC
-    facts = {ROWS_GIVEN: v.rows, ROWS_LEFT: v.avoidable, SECONDS: seconds, GAP: math.nan if gap is None else 100 * gap}
-    return Repaired(params, status, 0, v, states, seconds), facts
 
 
 # ---- judging -------------------------------------------------------------------------------------------------------
