@@ -30,7 +30,7 @@ from repair.errors import RepairError, Status
 from repair.filter import safe_actions
 from repair.limits import executed
 from repair.linearise import FreeWeights, Linearised
-from repair.network import Situations, actions, check_encodable, concatenate
+from repair.network import Situations, actions, check_encodable, concatenate, fitted
 from repair.once import by_branches, by_programs, mendable
 from repair.relax import Problem, Relaxation, relax
 from repair.screen import Acted, Perform, Screened, decisions, screen
@@ -201,11 +201,13 @@ def repair(
     *,
     folder: Path | None = None,
     progress: Progress | None = None,
+    examples: Situations | None = None,
 ) -> Repaired:
     """Repairs the weights of `model` that `config.free` names; the model itself is never changed.
 
     `perform(weights, round)` lets a policy act in physics. `folder`: keeps what each round found, and goes on from
-    there when called again with the same settings.
+    there when called again with the same settings. `examples`: states to learn from and to constrain besides those that
+    it comes to itself, counter-examples of a certificate, say.
 
     Raises:
       NotEncodable: the network is not one of ReLU layers with inputs linear in the state.
@@ -236,6 +238,11 @@ def repair(
             work.hard.append(situations.take(_worst(found, config.hard)))
             break
         lessons, hard = work.lessons(situations, params, number), situations.take(_worst(found, config.hard))
+        if number == 0 and examples is not None:
+            more = fitted(examples, situations)
+            lessons = _joined(lessons, work.lessons(more, params, number))
+            wrong = screen(work.must, more, work.act(params, more), bodies, work.kinematics)
+            hard = concatenate([hard, more.take(np.flatnonzero(wrong.avoidable))])
         work.pool.add(lessons)
         work.hard.append(hard)
         within = partial(_within, tell, number + 1, config.rounds + 1, work.history[-1])
@@ -289,6 +296,10 @@ def _within(tell: Progress, number: int, rounds: int, row: dict, done: int, tota
     tell(number, rounds, row | seen | {"descent": done / total})
 
 
+def _joined(one: Lessons, other: Lessons) -> Lessons:
+    return jax.tree.map(lambda *xs: np.concatenate(xs), one, other)
+
+
 def _score(row: dict) -> tuple[float, float]:
     return row["contact_steps"], row["avoidable"]
 
@@ -333,7 +344,7 @@ def _polish(work: _Work, params: Params, rows: Situations, tell: Progress) -> Pa
     """Quadratic programs for counter-examples that still break the constraint; None where there are none."""
     config = work.config
     now = screen(work.must, rows, work.act(params, rows), work.bodies, work.kinematics)
-    if not now.avoidable.any() or not config.polish:
+    if not now.avoidable.any() or not config.polish or not work.pool.count:
         return None
     lessons = _doubles(work.pool)
     anchors = lessons.situations.take(np.random.default_rng(config.seed).permutation(len(lessons))[: config.anchors])

@@ -60,6 +60,26 @@ def concatenate(parts: list[Situations]) -> Situations:
     return jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
 
 
+def fitted(situations: Situations, like: Situations) -> Situations:
+    """The same situations with as many places for senders as `like` has: empty ones are added.
+
+    Raises NotEncodable where there are more filled places than that.
+    """
+    senders, present = {}, {}
+    for name, places in like.senders.items():
+        room = places.shape[1]
+        of, here = situations.senders.get(name), situations.present.get(name)
+        senders[name] = np.zeros((len(situations), room, 4))
+        present[name] = np.zeros((len(situations), room), bool)
+        if of is None or here is None:
+            continue
+        if np.asarray(here)[:, room:].any():
+            raise NotEncodable(f"situations with more than {room} places of type {name} do not fit these scenes")
+        kept = min(room, of.shape[1])
+        senders[name][:, :kept], present[name][:, :kept] = of[:, :kept], here[:, :kept]
+    return Situations(own=np.asarray(situations.own, np.float64), senders=senders, present=present)
+
+
 def check_encodable(model: Model) -> ModelConfig:
     """The configuration of a network that repair understands.
 

@@ -30,6 +30,8 @@ from swarm_mjcf.errors import SpecError
 
 SAFETY = 1e-6
 """Taken off a group's bound, relative to 1 + itself: what the solver's tolerance may have added."""
+NOTHING = 1e-9
+"""Costs below this count as none [m/s^2]."""
 FINER = 0.2
 """Gap asked of groups, relative to that of the whole."""
 SHARE = 0.5
@@ -54,7 +56,7 @@ class Polished:
     """Proven by the solver within its tolerance: no weights in the box that keep the problem's margin cost less. None
     where it proved that there are none."""
     gap: float | None
-    """(incumbent - bound) / incumbent; 0 where the incumbent is 0."""
+    """(incumbent - bound) / incumbent."""
     violated: int
     """Conditions that `params` break, by the forward pass."""
     seconds: float
@@ -106,7 +108,7 @@ def polish(
     gap = None
     if incumbent is not None and bound is not None:
         bound = min(bound, incumbent)  # a start may do without the margin that the bound is of
-        gap = (incumbent - bound) / incumbent if incumbent > 0 else 0.0
+        gap = (incumbent - bound) / max(incumbent, NOTHING)
     violated = int((violations(problem, outputs(problem, best)) > 0).sum())
     return Polished(
         params=best,

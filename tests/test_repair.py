@@ -27,7 +27,7 @@ from repair.errors import NotEncodable, RepairError, Status
 from repair.limits import executed
 from repair.linearise import FreeWeights, Linearised
 from repair.loop import repair
-from repair.network import Situations, actions
+from repair.network import Situations, actions, fitted
 from repair.relax import Problem, Relaxation, relax
 from repair.screen import Acted, decisions, least, screen
 from repair.verify import clopper_pearson, verify
@@ -273,7 +273,7 @@ def drift(rng: np.random.Generator, scenes: int = 16, rows: int = 6, params=None
     _, _, graph = learning.random_swarm(0, COUNTS, batch=scenes)
     graph = jax.tree.map(lambda x: np.array(x), graph)
     nodes = np.zeros((scenes, rows + 1, 4, 4), np.float32)
-    angle = [*rng.uniform(0, 2 * np.pi, (scenes, 2)), 0, np.pi]
+    angle = rng.uniform(0, 2 * np.pi, (scenes, 2)) + np.array([0, np.pi])
     outward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     nodes[:, :, 0, :2] = 15 * outward[:, None, 0]
     nodes[:, 0, 2:, :2] = rng.uniform(7, 12, (scenes, 2, 1)) * outward
@@ -425,3 +425,35 @@ def test_the_last_layer_wants_discs():
     m = model()
     with pytest.raises(SpecError, match="disc with method last-layer"):
         repair(m, LoopConfig(method="last-layer", scenes=16, steps=6), BODIES, performing(m))
+
+
+def test_counter_examples_from_elsewhere_are_learned_and_constrained():
+    """Two obstacles where the scenes have room for one each; a neighbour's place is missing and filled up."""
+    m = model()
+    lone = approaching(50, 5)
+    lone = replace(
+        lone,
+        senders={name: x[:, :1] for name, x in lone.senders.items()},
+        present={name: x[:, :1] for name, x in lone.present.items()},
+    )
+    found = repair(m, SMALL, BODIES, performing(m), examples=lone)
+    without = repair(m, SMALL, BODIES, performing(m))
+    full = fitted(lone, without.rows)
+    assert len(found.rows) > len(without.rows)
+    assert full.present["agent"].shape[1:] == without.rows.present["agent"].shape[1:]
+
+    def broken(params: dict) -> int:
+        action = actions(params, m.scales, full)
+        return int(screen(Barrier(kinematics=MOTION), full, action, BODIES, MOTION).avoidable.sum())
+
+    assert broken(m.params) > 10
+    assert broken(found.params) <= broken(without.params)
+    assert broken(found.params) < 0.2 * broken(m.params)
+
+
+def test_more_bodies_than_places_are_refused():
+    one, two = approaching(2), approaching(2)
+    places, here = np.zeros((2, 2, 4)), np.ones((2, 2), bool)
+    crowded = replace(two, senders=two.senders | {"obstacle": places}, present=two.present | {"obstacle": here})
+    with pytest.raises(NotEncodable, match="more than 1 places of type obstacle"):
+        fitted(crowded, one)
