@@ -1,6 +1,7 @@
 """The command line: one frozen dataclass per command, its docstring is its help. Standard library only.
 
-Here are the commands around data and pictures; those that learn are in `swarmnet.config_learning`.
+Here are the commands around data and pictures; those that learn are in `swarmnet.config_learning`, those that
+make safe in `swarmnet.config_repair`.
 """
 
 from dataclasses import dataclass, fields
@@ -12,6 +13,7 @@ from envs.importers.config import ImportConfig
 from envs.shards import Shard
 from swarm_mjcf.errors import SpecError
 from swarmnet.config_learning import RL, Evaluate, Learn, Probe, Reproduce, Schedule, Train
+from swarmnet.config_repair import Certify, Repair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,14 +230,17 @@ class Bench:
     `adapters` (Gymnasium, PettingZoo, dm_env, as ratios to the environment itself), `throughput` (10 agents and 5
     obstacles with random actions and resets, batches up to 32k on a GPU), `imitation` (simulate, train, prediction
     error), `train` (windows/s, the share of time in the compiled step, one core against Keras where it is installed),
-    `rl` (env-steps/s of physics, rollout, update and whole PPO, beside the arithmetic's own time), `rendering` (frame
-    rates), `build` (scenes per second).
+    `rl` (env-steps/s of physics, rollout, update and whole PPO, beside the arithmetic's own time), `repair` (seconds
+    until a gap of 1% is proven against rows and box, with a figure beside the JSON), `rendering` (frame rates), `build`
+    (scenes per second).
 
     Example:
       swarmnet bench engines --json docs/results/bench-engines.json
     """
 
-    what: Literal["engines", "experts", "adapters", "throughput", "imitation", "train", "rl", "rendering", "build"]
+    what: Literal[
+        "engines", "experts", "adapters", "throughput", "imitation", "train", "rl", "repair", "rendering", "build"
+    ]
     """What to measure."""
     agents: tuple[int, ...] = (5, 10, 20, 100, 1000)
     """engines, experts: numbers of agents, each with 1 obstacle."""
@@ -248,11 +253,15 @@ class Bench:
     batch: tuple[int, ...] = ()
     """throughput, rl: scenes per batch; by default 64 and 512 (rl: 64, 256, 1024) on a CPU, 1024 to 32768 on a GPU."""
     scenes: int = 2000
-    """imitation, train: training scenes."""
+    """imitation, train, repair: training scenes."""
     scale: float = 0.8
     """imitation, train: factor on the number of gradient steps."""
     seed: int = 0
-    """imitation, train: seed of data and weights."""
+    """imitation, train, repair: seed of data and weights."""
+    run: Path | None = None
+    """repair: run folder of the network; by default one of preset thesis-ch5-small is trained, in minutes."""
+    seconds: float = 120.0
+    """repair: limit for a proof of edge functions; a quarter of it for those of the last layer [s]."""
     json: Path | None = None
     """Also write the results here, machine-readable."""
 
@@ -261,6 +270,8 @@ class Bench:
             value = getattr(self, field)
             if any(number < 1 for number in (value if isinstance(value, tuple) else (value,))):
                 raise SpecError(field, value, "at least 1")
+        if not self.seconds > 0:
+            raise SpecError("seconds", self.seconds, "above 0 [s]")
 
 
 Command = (
@@ -269,6 +280,8 @@ Command = (
     | Train
     | Schedule
     | RL
+    | Repair
+    | Certify
     | Evaluate
     | Learn
     | Probe

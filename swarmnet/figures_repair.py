@@ -4,11 +4,13 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from swarm_mjcf.errors import SwarmError
 from swarmnet.figures import MODEL, NARROW, STYLE, FigureFile, blank_figure, svg
@@ -20,15 +22,16 @@ FLOOR = 0.002
 
 
 def pareto(
-    points: Sequence[tuple[str, Mapping[str, float]]], contacts: str, costs: Sequence[str], *, note: str = ""
+    points: Sequence[tuple[str, Mapping[str, Any]]], contacts: str, costs: Sequence[str], *, note: str = ""
 ) -> Figure:
     """Contacts (log) over each of the costs; a colour for each name, a point for each of its `(name, values)`.
 
     Points without a cost's value are left out of its panel: a filter has no prediction error.
     """
     names = list(dict.fromkeys(name for name, _ in points))
+    lines = wrap(note, 55 * len(costs))
     with mpl.rc_context(PAPER):
-        figure = blank_figure(3.5 * len(costs), 3.4)
+        figure = blank_figure(3.5 * len(costs), 3.4 + 0.1 * len(lines))
         colours = dict(zip(names, mpl.colormaps["tab10"](np.arange(len(names)) % 10), strict=True))
         for column, cost in enumerate(costs):
             ax = figure.add_subplot(1, len(costs), column + 1)
@@ -36,22 +39,24 @@ def pareto(
                 pairs = [(v[cost], v[contacts]) for n, v in points if n == name and _there(v, cost, contacts)]
                 if pairs:
                     x, y = np.array(pairs).T
-                    ax.plot(x, np.maximum(y, FLOOR), "o", ms=4, color=colours[name], label=name)
+                    ax.plot(x, np.maximum(y, FLOOR), "o", ms=4, color=colours[name], gid=name, clip_on=False)
             ax.set(xlabel=cost, ylabel=contacts if column == 0 else "", yscale="log")
-            ax.axvline(1, color="0.7", lw=0.8, zorder=0)
+            if " / " in cost:
+                ax.axvline(1, color="0.7", lw=0.8, zorder=0)
         handles = [Line2D([], [], marker="o", ls="", ms=4, color=colours[n], label=n) for n in names]
-        lines = wrap(note, 110)
-        figure.legend(handles=handles, loc="upper center", ncols=min(len(names), 5), frameon=False, fontsize=7)
-        figure.subplots_adjust(top=0.82, bottom=0.2 + 0.03 * len(lines), wspace=0.25, left=0.1, right=0.98)
-        figure.text(0.02, 0.01, "\n".join(lines), fontsize=6, va="bottom", color="0.35")
+        figure.legend(handles=handles, loc="outside upper center", ncols=min(len(names), 5), frameon=False)
+        if lines:
+            below = (0.1 * len(lines) + 0.05) / figure.get_figheight()
+            figure.get_layout_engine().set(rect=(0, below, 1, 1 - below))  # type: ignore[union-attr]
+            figure.text(0.01, 0.01, "\n".join(lines), fontsize=6, va="bottom", color="0.35")
     return figure
 
 
-def _there(values: Mapping[str, float], *names: str) -> bool:
+def _there(values: Mapping[str, Any], *names: str) -> bool:
     return all(values.get(name) is not None and np.isfinite(values[name]) for name in names)
 
 
-def repair_rounds(rounds: Sequence[Mapping[str, float]]) -> Figure:
+def repair_rounds(rounds: Sequence[Mapping[str, Any]]) -> Figure:
     """Contact steps and avoidable violations of the constraint, in the fresh scenes of each round [%]."""
     with mpl.rc_context(STYLE):
         figure = blank_figure(NARROW, 3.2)
@@ -65,9 +70,13 @@ def repair_rounds(rounds: Sequence[Mapping[str, float]]) -> Figure:
         polished = [row["round"] for row in rounds if row.get("polished")]
         for number in polished:
             ax.axvline(number, color="0.8", lw=1, zorder=0)
-            ax.annotate("quadratic\nprograms", (number, 1), xycoords=("data", "axes fraction"), ha="right", va="top")
+            ax.annotate(
+                "quadratic programs", (number, 1), xycoords=("data", "axes fraction"), xytext=(0, 3), fontsize=9,
+                textcoords="offset points", ha="right",
+            )  # fmt: skip
         ax.set(xlabel="round (scenes of its own, not learned from before)", ylabel="share [%]", yscale="log")
-        ax.legend(frameon=False)
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        figure.legend(loc="outside upper left")
     return figure
 
 
@@ -78,7 +87,7 @@ def make_repair_figures(run: str | Path) -> list[FigureFile]:
         return []
     try:
         rounds = json.loads(path.read_text())["rounds"]
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise SwarmError(f"{path}: is damaged; `swarmnet repair` writes it anew") from error
     if not rounds:
         return []

@@ -14,8 +14,8 @@ from swarmnet.cli import main
 from swarmnet.results import Results, Row, write_results
 
 COMMANDS = (
-    "simulate", "merge", "import", "export", "train", "schedule", "evaluate", "learn", "probe", "render", "demo",
-    "report", "doctor", "bench", "reproduce",
+    "simulate", "merge", "import", "export", "train", "schedule", "rl", "repair", "certify", "evaluate", "learn",
+    "probe", "render", "demo", "report", "doctor", "bench", "reproduce",
 )  # fmt: skip
 HEAVY = ("jax", "mujoco", "flax", "orbax", "h5py", "matplotlib", "optax", "dm_control", "numpy")
 PROBE = f"""
@@ -87,6 +87,10 @@ def test_no_command_explains_itself():
         (("render",), "Trajectories to show"),
         (("bench", "weather"), "weather"),
         (("render", "x.h5", "--camera", "inside"), "inside"),
+        (("repair", "x", "--method", "magic"), "magic"),
+        (("repair", "x", "--descent.stepz", "3"), "--descent.stepz"),
+        (("certify", "x", "--goal", "1"), "--goal"),
+        (("evaluate", "x", "--filter", "wall"), "wall"),
     ],
 )
 def test_a_wrong_word_is_named_and_exits_with_2(arguments: tuple[str, ...], named: str, capsys):
@@ -103,9 +107,25 @@ def test_a_wrong_word_is_named_and_exits_with_2(arguments: tuple[str, ...], name
     [
         (("simulate", "--scenes", "0"), "scenes: 0 was given"),
         (("simulate", "--preset", "moon"), "preset: 'moon' was given"),
-        (("train", "x.h5", "--model", "gat"), "one of thesis-ch3, thesis-ch3-blind, thesis-ch5, best"),
+        (
+            ("train", "x.h5", "--model", "gat"),
+            "one of thesis-ch3, thesis-ch3-blind, thesis-ch5, thesis-ch5-small, best",
+        ),
         (("train", "x.h5", "--stage-steps", "5", "5", "5", "5"), "multiples of chunk"),
         (("train", "x.h5", "--chunk", "0"), "chunk: 0 was given"),
+        (("repair", "x", "--rounds", "-1"), "rounds: -1 was given"),
+        (("repair", "x", "--scenes", "0"), "scenes: 0 was given"),
+        (("repair", "x", "--test-scenes", "-1"), "test_scenes: -1 was given"),
+        (("repair", "x", "--constraint.name", "wall"), "one of barrier, disc, polygon, diamond, roll-out"),
+        (("repair", "x", "--constraint.margin", "nan"), "margin: nan was given"),
+        (("repair", "x", "--descent.steps", "0"), "steps: 0 was given"),
+        (("repair", "x", "--reserve-share", "1.5"), "reserve_share: 1.5 was given"),
+        (("certify", "x", "--distance", "0"), "distance: 0.0 was given"),
+        (("certify", "x", "--share", "2"), "share: 2.0 was given"),
+        (("certify", "x", "--goal", "nan", "0"), "goal: (nan, 0.0) was given"),
+        (("certify", "x", "--neighbour-half", "-1", "0"), "neighbour_half: (-1.0, 0.0) was given"),
+        (("certify", "x", "--cells", "-1"), "cells: -1 was given"),
+        (("certify", "x", "--time-limit", "nan"), "time_limit: nan was given"),
     ],
 )
 def test_a_value_that_its_own_configuration_refuses_exits_with_2(arguments, named: str, capsys, tmp_path, monkeypatch):
@@ -128,6 +148,13 @@ def test_a_value_that_its_own_configuration_refuses_exits_with_2(arguments, name
         (("evaluate", "no/run"), "no/run/checkpoints: no such checkpoint folder"),
         (("render", "no/such.h5"), "no/such.h5"),
         (("report", "no/run"), "no/run"),
+        (("repair", "no/run", "--run", "r"), "no/run/checkpoints: no such checkpoint folder"),
+        (("repair", "no/run", "--run", "no/../no/run"), "another folder than the one of the model"),
+        (("certify", "no/run"), "no/run/checkpoints: no such checkpoint folder"),
+        (("evaluate", "--policy", "expert", "--filter-margin", "1"), "filter_margin: 1.0 was given"),
+        (("evaluate", "--policy", "expert", "--filter", "disc", "--filter-margin", "-1"), "margin: -1.0 was given"),
+        (("evaluate", "--policy", "expert", "--filter", "barrier", "--filter-share", "0"), "share: 0.0 was given"),
+        (("evaluate", "--policy", "expert", "--data", "x.h5", "--filter", "disc"), "filter: 'disc' was given"),
         (("demo", "--model", "thesis-ch3"), "thesis-ch5 or best"),
         (("demo", "--scale", "0"), "scale"),
     ],

@@ -15,9 +15,10 @@ from envs.experts.registry import make_expert
 from envs.state import State
 from envs.storage import save
 from envs.swarm_env import scene_keys
+from repair.config import ConstraintConfig
 from swarm_mjcf.errors import SpecError
 from swarm_mjcf.spec import SceneSpec
-from swarmnet.policies import PolicyError, Source, checked, find_policy, with_sight
+from swarmnet.policies import PolicyError, Source, checked, find_policy, with_shield, with_sight
 
 WORLD = make_world("clear", num_agents=3)
 KEYS = scene_keys(0, range(2))
@@ -169,3 +170,32 @@ def test_a_source_says_whether_it_acts():
 def test_only_a_trained_model_can_see_less():
     with pytest.raises(SpecError, match="nearest: 3 was given, allowed is nothing beside expert"):
         with_sight(find_policy("expert"), nearest=3)
+
+
+def test_a_filter_lets_through_what_is_allowed_and_brakes_the_rest():
+    spec, source = WORLD.scene, find_policy("mine:brake")
+    shielded = with_shield(source, ConstraintConfig())
+    assert (shielded.name, shielded.given) == ("mine:brake, filtered", "mine:brake")
+    assert with_shield(source, None) is source
+    # One agent 3 m before the obstacle, one far away, both at 5 m/s towards it; a policy that only speeds up.
+    reach = spec.agent_radius + spec.obstacle_radius
+    position = np.array([[[-reach - 3.0, 0.0], [200.0, 0.0], [0.0, 300.0]]])
+    velocity = np.array([[[5.0, 0.0], [-5.0, 0.0], [0.0, 0.0]]])
+    state = scene_state(spec, position, velocity, obstacle=np.zeros((1, 1, 2)), obstacle_present=np.ones((1, 1), bool))
+    moving = jax.tree.map(jnp.asarray, state)
+    faster = Source(given="faster", name="faster", make=lambda world: lambda state, params, key: 0.5 * state.velocity)
+    policy, params = with_shield(faster, ConstraintConfig(margin=0.5)).policy(WORLD)
+    bare, action = 0.5 * velocity, np.asarray(policy(moving, params, KEYS[:1]))
+    np.testing.assert_allclose(action[0, 1:], bare[0, 1:], atol=1e-5)
+    # After the step it can just still brake, with 70% of the limit, before it comes to half a metre.
+    dt, substeps, braking = spec.dt, spec.substeps, action[0, 0, 0]
+    speed = 5.0 + dt * braking
+    left = 2.5 - 5.0 * dt - dt**2 * (substeps + 1) / (2 * substeps) * braking
+    assert braking < 0
+    assert speed**2 == pytest.approx(2 * 0.7 * spec.max_acceleration * left, rel=1e-3)
+
+
+def test_only_what_acts_can_be_filtered(here: Path):
+    save("some.h5", make_trajectories())
+    with pytest.raises(SpecError, match=r"filter: 'disc' was given, allowed is nothing beside some\.h5"):
+        with_shield(find_policy("some.h5"), ConstraintConfig(name="disc"))

@@ -205,6 +205,52 @@ def test_only_trained(tmp_path) -> None:
     assert "In closed loop" not in text
 
 
+def repaired_document(**changes) -> dict:
+    """What `swarmnet repair` writes, with numbers of its own."""
+    rounds = [
+        {"round": k, "contact_steps": 0.0213 / (k + 1), "contact_steps_agent": 0.0111, "contact_steps_obstacle": 0.0102,
+         "trajectories": 0.25 * (1 - k), "scenes": 64, "avoidable": 0.0456 * (1 - k), "violated": 0.05,
+         "goal_distance": 11.7, "changed": 0.789 * k}
+        for k in range(2)
+    ]  # fmt: skip
+    return {
+        "status": "feasible",
+        "best_round": 1,
+        "verification": {"rows": 1234, "avoidable": 0},
+        "settings": {"free": ["edge/<b>/*"], "constraint": {"name": "barrier", "margin": 0.5, "share": 0.7}},
+        "rounds": rounds,
+    } | changes
+
+
+def test_a_repair_says_what_it_guarantees(tmp_path) -> None:
+    (tmp_path / "repair.json").write_text(json.dumps(repaired_document()))
+    text = page_of(tmp_path).text
+    for words in (
+        "Only edge/<b>/* were changed",
+        "margin 0.5 m, 70% of the brakes",
+        "of 1234 decisions that broke it without need while the policy was repaired, all of them keep it now",
+        "checked in 64-bit arithmetic",
+        "had a contact; with 95% confidence at most 4.6%",  # 1 - 0.05^(1/64)
+        "What is not claimed:",
+        "Status: feasible",
+        "What fewer contacts cost",
+        "Repair, round by round",
+        "2.13",
+        "0.789",
+    ):
+        assert words in text
+    document = repaired_document(status="elastic", verification={"rows": 1234, "avoidable": 7})
+    (tmp_path / "repair.json").write_text(json.dumps(document))
+    assert "7 of them still break it" in page_of(tmp_path).text
+
+
+def test_a_damaged_repair_is_named(tmp_path) -> None:
+    for text in ("{", "{}", "[]", json.dumps(repaired_document(best_round=9))):
+        (tmp_path / "repair.json").write_text(text)
+        with pytest.raises(SwarmError, match=r"repair\.json: is damaged"):
+            write_report(tmp_path)
+
+
 def test_empty_and_missing_folders(tmp_path) -> None:
     text = page_of(tmp_path).text
     assert f"swarmnet train DATA.h5 --run {tmp_path}" in text

@@ -11,7 +11,8 @@ from envs.plain import plain
 from gnn.checkpoint import Checkpoints, Model, load_model
 from gnn.train import fingerprint
 from repair.config import LoopConfig
-from repair.loop import Repaired, repair
+from repair.linearise import FreeWeights
+from repair.loop import Repaired, contacts, repair
 from repair.network import check_encodable
 from repair.verify import clopper_pearson
 from swarm_mjcf.errors import SpecError, SwarmError
@@ -33,6 +34,8 @@ def run(config: Repair) -> int:
         raise SpecError("run", str(config.run), "another folder than the one of the model that is repaired")
     model = load_model(config.init / "checkpoints")
     check_encodable(model)
+    if config.polish:
+        FreeWeights.matching(model.params, config.polish)  # not only when it comes to that
     asked = {name: value for name in ("num_agents", "num_obstacles") if (value := getattr(config, name)) is not None}
     simulated = replace(training_world(model), engine=config.engine, **asked)
     world, how = simulated.world(), part_of(LoopConfig, config)
@@ -40,14 +43,23 @@ def run(config: Repair) -> int:
         model, world, scenes=how.scenes, steps=how.steps, seed=SCENES + how.seed, engine=config.engine
     )
     _claim(config.run, how, model, asked)
-    with progress(f"repair by {how.method}") as update:
+    if _done(config.run):
+        print(f"{config.run}: was repaired already")
+    else:
+        with progress(f"repair by {how.method}") as update:
 
-        def report(done: int, total: int, row: dict) -> None:
-            update(done, total, note(row))
+            def report(done: int, total: int, row: dict) -> None:
+                update(done, total, note(row))
 
-        found = repair(model, how, world.scene, perform, folder=config.run / "rounds", progress=report)
-    keep(config.run, model, how, found)
-    print(words(found, how))
+            try:
+                found = repair(model, how, world.scene, perform, folder=config.run / "rounds", progress=report)
+            except SwarmError:
+                _release(config.run)
+                raise
+        # The best round was chosen by its scenes; what it is worth is for others to say.
+        fresh = contacts(perform(found.params, how.rounds + 2))
+        keep(config.run, model, how, found, fresh)
+        print(words(found, how, fresh))
     if not config.test_scenes:
         return 0
     both = {"run": config.run, "reference": str(config.init), "engine": config.engine}
@@ -67,12 +79,16 @@ def note(row: dict) -> str:
     return "  ".join(parts)
 
 
-def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired) -> Model:
-    """Saves the repaired model in FOLDER/checkpoints and FOLDER/repair.json; returns it as it was saved."""
+def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired, fresh: dict | None = None) -> Model:
+    """Saves the repaired model in FOLDER/checkpoints and FOLDER/repair.json; returns it as it was saved.
+
+    `fresh`: contacts in scenes that no round had.
+    """
     about = {name: value for name, value in model.about.items() if name != "step"}
     about |= {"repair": {"settings": plain(how), "status": found.status.value, "of": fingerprint(model.params)}}
     checkpoints = Checkpoints(folder / "checkpoints")
-    step = (checkpoints.latest() or 0) + 1
+    # Of gradient steps of imitation there are as many as before; a newer save of the same repair counts on.
+    step = max(checkpoints.latest() or 0, model.about.get("step", 1) - 1) + 1
     checkpoints.save(step, {"params": jax.tree.map(np.asarray, found.params)}, about)
     checkpoints.close()
     document = {
@@ -81,6 +97,8 @@ def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired) -> Model:
         "verification": found.verification.plain(),
         "settings": plain(how),
         "rounds": found.history,
+        "fresh": fresh,
+        "gap": found.gap,
         "seconds": round(found.seconds, 1),
         "commit": commit(),
         "hardware": hardware(),
@@ -89,18 +107,17 @@ def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired) -> Model:
     return Model(model.config, model.scales, model.integrator, found.params, about | {"step": step})
 
 
-def words(found: Repaired, how: LoopConfig) -> str:
-    """What was done and what holds, in plain words."""
-    v, last = found.verification, next(row for row in found.history if row["round"] == found.best)
-    first = found.history[0]
-    touched = round(last["trajectories"] * last["scenes"])
-    _, most = clopper_pearson(touched, last["scenes"])
+def words(found: Repaired, how: LoopConfig, fresh: dict) -> str:
+    """What was done and what holds, in plain words. `fresh`: contacts in scenes that no round had."""
+    v, before = found.verification, found.history[0]["contact_steps"]
+    touched = round(fresh["trajectories"] * fresh["scenes"])
+    _, most = clopper_pearson(touched, fresh["scenes"])
     lines = [
         f"status: {found.status.value}, after {found.seconds:.0f} s; weights of round {found.best}",
         f"  {v.rows} training decisions that broke the {how.constraint.name} without need: "
         f"{v.avoidable} still do as executed, {v.violated_before_clip} before the limits clip them",
-        f"  in {last['scenes']} scenes that were not learned from: contact steps {100 * first['contact_steps']:.3g}% "
-        f"-> {100 * last['contact_steps']:.3g}%; {touched} scenes with a contact, so with 95% confidence at most "
+        f"  in {fresh['scenes']} scenes that no round had: contact steps {100 * fresh['contact_steps']:.3g}% (before, "
+        f"in others: {100 * before:.3g}%); {touched} scenes with a contact, so with 95% confidence at most "
         f"{100 * most:.2g}% of such scenes have one",
         "  this is evidence about scenes like these, no proof for others: `swarmnet certify` proves a region",
     ]
@@ -122,3 +139,19 @@ def _claim(folder: Path, how: LoopConfig, model: Model, asked: dict) -> None:
     if (folder / "checkpoints").exists():
         raise SwarmError(f"{folder}: holds a model that no repair made; name another --run")
     write_whole(path, json.dumps(mine, indent=1) + "\n")
+
+
+def _release(folder: Path) -> None:
+    """Takes a claim back where nothing has come of it."""
+    if [path.name for path in folder.iterdir()] == ["settings.json"]:
+        (folder / "settings.json").unlink()
+        folder.rmdir()
+
+
+def _done(folder: Path) -> bool:
+    """Whether a repair came to its end here; a damaged repair.json is written anew."""
+    try:
+        known = json.loads((folder / "repair.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(known, dict) and {"status", "rounds"} <= set(known) and (folder / "checkpoints").is_dir()
