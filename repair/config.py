@@ -124,6 +124,9 @@ class LoopConfig:
     """thesis: layers that take turns in being free; the thesis has results for the last one."""
     box: float = 0.3
     """thesis: how far a weight of the free layer may go."""
+    solver: Literal["highspy", "HIGHS", "SCIP", "GUROBI"] = "highspy"
+    """thesis: highspy starts HiGHS from the weights that are there; the others are called through cvxpy, SCIP and
+    GUROBI where they are installed."""
     solver_seconds: float = 120.0
     """thesis, last-layer: time for each program [s]."""
     descent: DescentConfig = field(default_factory=DescentConfig)
@@ -140,6 +143,11 @@ class LoopConfig:
         for name, low in (("rounds", 0), ("scenes", 1), ("steps", 1), ("seed", 0), ("lessons", 1), ("pool", 1)):
             if getattr(self, name) < low:
                 raise SpecError(name, getattr(self, name), f"at least {low}")
+        if not 0 < self.price < float("inf"):
+            raise SpecError("price", self.price, "a finite number above 0")
+        kinds = {"thesis": ("barrier", "polygon", "diamond"), "last-layer": ("disc",)}.get(self.method, CONSTRAINTS)
+        if self.constraint.name not in kinds:
+            raise SpecError("constraint", self.constraint.name, f"{' or '.join(kinds)} with method {self.method}")
         for name in ("hard", "anchors", "states"):
             if getattr(self, name) < 1:
                 raise SpecError(name, getattr(self, name), "at least 1")

@@ -8,10 +8,13 @@ there is no such theorem for loops of this kind.
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
 
 import jax
 import numpy as np
@@ -35,6 +38,7 @@ from repair.once import by_branches, by_programs, mendable
 from repair.relax import Problem, Relaxation, relax
 from repair.screen import Acted, Perform, Screened, decisions, screen
 from repair.verify import Verification, verify
+from swarm_mjcf.errors import SwarmError
 
 Progress = Callable[[int, int, dict], None]
 """`(done, total, what is known)`; total is the number of rounds."""
@@ -152,7 +156,7 @@ class _Work:
         path = self.folder / f"round-{number:02d}.npz" if self.folder is not None else None
         if path is None or not path.exists():
             return None
-        with np.load(path, allow_pickle=False) as found:
+        with _readable(path) as found:
 
             def tree(kind: str, of: object) -> object:
                 count = len(jax.tree.leaves(of))
@@ -167,6 +171,15 @@ class _Work:
             params = tree("params", self.origin)
             assert isinstance(params, dict)
             return params
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[Any]:
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            yield found
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise SwarmError(f"{path}: is damaged; remove it and the rounds after it, and the repair goes on") from error
 
 
 NEAR = 2.0

@@ -52,6 +52,7 @@ def by_programs(
     limits = Limits(seconds=config.solver_seconds)
     found = layerwise(
         model.params, problem, radius=config.box, layers=config.layers, rounds=max(config.rounds, 1), limits=limits,
+        solver=config.solver,
         progress=progress,
     )  # fmt: skip
     taken = [step.gap for step in found.history if step.accepted]

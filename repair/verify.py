@@ -34,7 +34,7 @@ class Verification:
     worst: float
     """Least slack of an executed action among avoidable rows, in the constraint's unit; infinite without any row."""
     deviation: float | None
-    """Root mean square change of the executed actions [m/s^2]."""
+    """Root mean square change of the network's own outputs [m/s^2]."""
 
     @property
     def holds_before_clip(self) -> bool:

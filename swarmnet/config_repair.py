@@ -89,6 +89,12 @@ class Repair(LoopConfig):
     """Agents of the scenes it acts in; those of the training data by default."""
     num_obstacles: int | None = None
     """Obstacles of the scenes it acts in; those of the training data by default."""
+    min_agents: int | None = None
+    """Fewest agents of a scene; as in the training data by default."""
+    min_obstacles: int | None = None
+    """Fewest obstacles of a scene; as in the training data by default. Scenes that have one teach more."""
+    examples: tuple[Path, ...] = ()
+    """Files counter-examples.npz of `swarmnet certify`: states to learn from and to constrain besides its own."""
     engine: str = "auto"
     """Physics engine: auto, native, mjx, mjx-warp."""
     test_scenes: int = 1000

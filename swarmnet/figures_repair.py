@@ -17,6 +17,8 @@ from swarmnet.figures import MODEL, NARROW, STYLE, FigureFile, blank_figure, svg
 from swarmnet.results import write_whole
 from swarmnet.sheets import STYLE as PAPER
 
+WIDE = 4.0
+"""Ratio of the largest to the smallest cost from which on its axis is logarithmic."""
 FLOOR = 0.002
 """Contact steps [%] drawn for none at all: the axis is logarithmic."""
 
@@ -33,14 +35,19 @@ def pareto(
     with mpl.rc_context(PAPER):
         figure = blank_figure(3.5 * len(costs), 3.4 + 0.1 * len(lines))
         colours = dict(zip(names, mpl.colormaps["tab10"](np.arange(len(names)) % 10), strict=True))
+        first = None
         for column, cost in enumerate(costs):
-            ax = figure.add_subplot(1, len(costs), column + 1)
+            first = ax = figure.add_subplot(1, len(costs), column + 1, sharey=first)
             for name in names:
                 pairs = [(v[cost], v[contacts]) for n, v in points if n == name and _there(v, cost, contacts)]
                 if pairs:
                     x, y = np.array(pairs).T
                     ax.plot(x, np.maximum(y, FLOOR), "o", ms=4, color=colours[name], gid=name, clip_on=False)
             ax.set(xlabel=cost, ylabel=contacts if column == 0 else "", yscale="log")
+            ax.label_outer(remove_inner_ticks=False)
+            reached = [v[cost] for _, v in points if _there(v, cost, contacts)]
+            if reached and min(reached) > 0 and max(reached) > WIDE * min(reached):
+                ax.set_xscale("log")
             if " / " in cost:
                 ax.axvline(1, color="0.7", lw=0.8, zorder=0)
         handles = [Line2D([], [], marker="o", ls="", ms=4, color=colours[n], label=n) for n in names]

@@ -86,8 +86,9 @@ def repair_table(facts: Facts) -> dict[str, str]:
         found = json.loads(path.read_text())
         rounds, v, how = found["rounds"], found["verification"], found["settings"]
         rule = how["constraint"]
-        judged = next(row for row in rounds if row["round"] == found["best_round"])
-    except (ValueError, KeyError, StopIteration) as error:
+        # The best round was chosen by its own scenes: what it is worth is for others to say.
+        judged = found.get("fresh") or next(row for row in rounds if row["round"] == found["best_round"])
+    except (ValueError, KeyError, TypeError, StopIteration) as error:
         raise SwarmError(f"{path}: is damaged; `swarmnet repair` writes it anew") from error
     left = v["avoidable"]
     hold = "all of them keep it" if not left else f"{left} of them still break it"

@@ -31,7 +31,7 @@ from repair.network import Situations, actions, fitted
 from repair.relax import Problem, Relaxation, relax
 from repair.screen import Acted, decisions, least, screen
 from repair.verify import clopper_pearson, verify
-from swarm_mjcf.errors import SpecError
+from swarm_mjcf.errors import SpecError, SwarmError
 
 MOTION = Integrator(dt=0.3, substeps=30, max_speed=10.0, max_acceleration=10.0)
 BODIES = SimpleNamespace(agent_radius=1.0, obstacle_radius=3.0)
@@ -394,6 +394,14 @@ def test_a_descent_that_diverges_says_so_and_changes_nothing():
         (lambda: LoopConfig(reserve_share=0.0), "reserve_share"),
         (lambda: LoopConfig(reserve_margin=-1.0), "reserve_margin"),
         (lambda: LoopConfig(hard=0), "hard"),
+        (lambda: LoopConfig(price=-1.0), "price"),
+        (lambda: LoopConfig(price=float("nan")), "price"),
+        (
+            lambda: LoopConfig(method="thesis", constraint=ConstraintConfig(name="disc")),
+            "barrier or polygon or diamond",
+        ),
+        (lambda: LoopConfig(method="last-layer"), "disc with method last-layer"),
+        (lambda: LoopConfig(box=-1.0), "box"),
         (lambda: ConstraintConfig(name="wall"), "constraint"),
         (lambda: ConstraintConfig(share=1.5), "share"),
         (lambda: ConstraintConfig(margin=float("nan")), "margin"),
@@ -421,10 +429,12 @@ def test_methods_of_one_step_mend_the_states_they_took(method, name):
         assert path.startswith("readout/") or np.array_equal(before, after)
 
 
-def test_the_last_layer_wants_discs():
+def test_a_damaged_round_is_named(tmp_path):
     m = model()
-    with pytest.raises(SpecError, match="disc with method last-layer"):
-        repair(m, LoopConfig(method="last-layer", scenes=16, steps=6), BODIES, performing(m))
+    repair(m, SMALL, BODIES, performing(m), folder=tmp_path)
+    (tmp_path / "round-01.npz").write_bytes(b"PK nothing")
+    with pytest.raises(SwarmError, match=r"round-01.npz: is damaged"):
+        repair(m, SMALL, BODIES, performing(m), folder=tmp_path)
 
 
 def test_counter_examples_from_elsewhere_are_learned_and_constrained():

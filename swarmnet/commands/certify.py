@@ -2,8 +2,11 @@
 
 import io
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -13,6 +16,7 @@ from repair.certify import Certificate, Effort, certify
 from repair.constraints.barrier import Barrier
 from repair.network import Situations, check_encodable
 from repair.ring import Box, Region, Ring
+from swarm_mjcf.errors import SwarmError
 from swarmnet.config_repair import Certify
 from swarmnet.judge import training_world
 from swarmnet.progress import progress
@@ -73,9 +77,18 @@ def packed(situations: Situations, slack: np.ndarray) -> bytes:
     return file.getvalue()
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            yield arrays
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise SwarmError(f"{path}: holds no counter-examples; `swarmnet certify` writes them") from error
+
+
 def unpacked(path: Path) -> Situations:
     """What `packed` wrote to a file."""
-    with np.load(path, allow_pickle=False) as arrays:
+    with _opened(path) as arrays:
         parts: dict[str, dict] = {
             part: {name.split("/")[1]: arrays[name] for name in arrays if name.startswith(f"{part}/")}
             for part in ("senders", "present")

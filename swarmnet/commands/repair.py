@@ -13,11 +13,12 @@ from gnn.train import fingerprint
 from repair.config import LoopConfig
 from repair.linearise import FreeWeights
 from repair.loop import Repaired, contacts, repair
-from repair.network import check_encodable
+from repair.network import Situations, check_encodable, concatenate, fitted
 from repair.verify import clopper_pearson
 from swarm_mjcf.errors import SpecError, SwarmError
 from swarmnet.acting import make_perform
 from swarmnet.commands import evaluate
+from swarmnet.commands.certify import unpacked
 from swarmnet.config import Evaluate, part_of
 from swarmnet.config_repair import Repair
 from swarmnet.judge import training_world
@@ -39,10 +40,13 @@ def run(config: Repair) -> int:
     asked = {name: value for name in ("num_agents", "num_obstacles") if (value := getattr(config, name)) is not None}
     simulated = replace(training_world(model), engine=config.engine, **asked)
     world, how = simulated.world(), part_of(LoopConfig, config)
+    least = {name: value for name in ("min_agents", "min_obstacles") if (value := getattr(config, name)) is not None}
+    world = replace(world, spawn=replace(world.spawn, **least))
+    examples = concatenate_fitted([unpacked(path) for path in config.examples])
     perform = make_perform(
         model, world, scenes=how.scenes, steps=how.steps, seed=SCENES + how.seed, engine=config.engine
     )
-    _claim(config.run, how, model, asked)
+    _claim(config.run, how, model, asked | least | {"examples": [str(path) for path in config.examples]})
     if _done(config.run):
         print(f"{config.run}: was repaired already")
     else:
@@ -52,7 +56,9 @@ def run(config: Repair) -> int:
                 update(done, total, note(row))
 
             try:
-                found = repair(model, how, world.scene, perform, folder=config.run / "rounds", progress=report)
+                found = repair(
+                    model, how, world.scene, perform, folder=config.run / "rounds", progress=report, examples=examples
+                )
             except SwarmError:
                 _release(config.run)
                 raise
@@ -64,6 +70,14 @@ def run(config: Repair) -> int:
         return 0
     both = {"run": config.run, "reference": str(config.init), "engine": config.engine}
     return evaluate.run(Evaluate(**both, **asked, scenes=config.test_scenes, videos=config.videos))
+
+
+def concatenate_fitted(parts: list[Situations]) -> Situations | None:
+    """Situations of several files, which may have unlike numbers of places; None of no file."""
+    if not parts:
+        return None
+    roomiest = max(parts, key=lambda part: sum(places.shape[1] for places in part.senders.values()))
+    return concatenate([fitted(part, roomiest) for part in parts])
 
 
 def note(row: dict) -> str:
