@@ -1,6 +1,7 @@
 """RUN/report.html: one self-contained page of what a run folder holds. Its fixed words are in report.html."""
 
 import base64
+import json
 import mimetypes
 import platform
 import re
@@ -16,6 +17,7 @@ from envs.config import RewardConfig
 from envs.plain import plain
 from envs.trajectories import versions
 from gnn.config import TrainConfig
+from repair.config import LoopConfig
 from swarm_mjcf.errors import SwarmError
 from swarmnet.config import RL
 from swarmnet.figures import FigureFile, make_figures
@@ -100,6 +102,11 @@ def _lead(facts: Facts) -> str:
         steps = f", {facts.metrics[-1]['env_steps']:.0f} env-steps" if facts.metrics else ""
         said.append(
             f"PPO then improved it in {facts.about['step']} iterations{steps}{_minutes(facts)} ({mode_of(facts.ppo)})."
+        )
+    if facts.repair:
+        said.append(
+            f"A repair then changed its weights so that the {escape(facts.repair['settings']['constraint']['name'])} "
+            "holds; what that guarantees stands below."
         )
     if facts.evaluation:
         e, (_, obstacles, agents) = facts.evaluation, facts.counts or (0, 0, 0)
@@ -267,9 +274,9 @@ def _settings(facts: Facts) -> str:
 
 
 def _again(facts: Facts) -> list[tuple[str, str]]:
-    """The commands; before PPO come those of the run that it started from."""
+    """The commands; before PPO or a repair come those of the run that it started from."""
     lines, data = commands(facts), ("simulate", "train", "demo", "import", "learn")
-    if not facts.ppo:
+    if not (facts.ppo or facts.repair):
         return lines
     begun = facts.origin or facts.run.with_name(f"{facts.run.name}-imitation")
     before = commands(
@@ -277,9 +284,33 @@ def _again(facts: Facts) -> list[tuple[str, str]]:
     )
     return [
         *(line for line in before if line[0].split()[1] in data),
-        (_rl_command(facts, begun), "PPO"),
+        (_repair_command(facts, begun), "repair") if facts.repair else (_rl_command(facts, begun), "PPO"),
         *(line for line in lines if line[0].split()[1] not in data),
     ]
+
+
+def _repair_command(facts: Facts, begun: Path) -> str:
+    """The command that repairs the model of `begun` in this way."""
+    words = ["swarmnet", "repair", str(begun), "--run", str(facts.run)]
+    given, usual = flat((facts.repair or {})["settings"]), flat(plain(LoopConfig()))
+    told = facts.run / "settings.json"
+    if told.exists():
+        given |= {name: value for name, value in json.loads(told.read_text()).items() if name not in ("settings", "of")}
+    for name, value in given.items():
+        if value != usual.get(name) and value not in (None, []):
+            words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
+    return shlex.join(words)
+
+
+def flat(settings: dict, before: str = "") -> dict:
+    """Settings of settings as one level, `descent.steps`; tuples as lists, as JSON has them."""
+    found = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            found |= flat(value, f"{before}{name}.")
+        else:
+            found[before + name] = list(value) if isinstance(value, tuple) else value
+    return found
 
 
 def _rl_command(facts: Facts, begun: Path) -> str:

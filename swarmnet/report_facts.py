@@ -47,6 +47,11 @@ class Facts:
         return (self.about or {}).get("rl")
 
     @property
+    def repair(self) -> dict | None:
+        """What a repair left with the weights: settings, status; None where none was made."""
+        return (self.about or {}).get("repair")
+
+    @property
     def imitation(self) -> dict | None:
         """Description of what has learned by imitation: of the model, or of the one that PPO started from; None for
         random weights."""
@@ -57,9 +62,9 @@ class Facts:
 
     @property
     def origin(self) -> Path | None:
-        """Run folder that PPO started from, where the evaluation names it as reference."""
+        """Run folder that PPO or a repair started from, where the evaluation names it as reference."""
         given = (self.evaluation or {}).get("given", {}).get("reference")
-        return Path(given) if self.ppo and given and (Path(given) / "checkpoints").is_dir() else None
+        return Path(given) if (self.ppo or self.repair) and given and (Path(given) / "checkpoints").is_dir() else None
 
     def pair(self, figure: str) -> tuple[dict, dict] | None:
         """Estimates of policy and reference, where both were measured; contact figures only with contacts on."""

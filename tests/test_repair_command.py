@@ -1,8 +1,10 @@
 """`swarmnet repair`, `certify` and `evaluate --filter` from one end to the other, small; and docs/repair.md."""
 
 import hashlib
+import html
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +22,7 @@ from envs.storage import save
 from gnn.checkpoint import Checkpoints, describe, load_model
 from gnn.config import PRESETS, TrainConfig
 from gnn.decode import Integrator
-from swarmnet.cli import main
+from swarmnet.cli import main, parse
 from swarmnet.commands.certify import unpacked
 
 ROOT = Path(__file__).parent.parent
@@ -112,6 +114,11 @@ def test_from_one_end_to_the_other(given: Path, tmp_path: Path, capsys):
     for words in ("What is guaranteed", "64-bit arithmetic", "What is evidence", "What is not claimed"):
         assert words in report
     assert "trained for 700 gradient steps" in report
+    assert "A repair then changed its weights so that the barrier holds" in report
+    commands = [html.unescape(line) for line in re.findall(r"swarmnet repair .*", report)]
+    again = [word for word in shlex.split(commands[0].split("  #")[0])]
+    config, wanted = parse(again[1:]), parse((*asked, "--test-scenes", "1000", "--videos", "3", "--engine", "auto"))
+    assert config == wanted
     judged = json.loads((run / "evaluation.json").read_text())
     assert judged["scenes"] == 4
     assert len(judged["collisions"]) == 2
