@@ -159,10 +159,10 @@ class _Work:
 
     def bound_groups(self, largest: int, until: float) -> None:
         """Bounds groups of 1, 2, 4.. rows, smaller ones than all rows; stops when time is up or a group is infeasible,
-        as all rows are then."""
+        as all rows are then. Rows that the free layer does not reach are in none."""
         every = len(self.problem.situations)
-        groups: list[Group] = [(row,) for row in range(every)]
         features = _features(self.params, self.problem, self.free)
+        groups: list[Group] = [(int(row),) for row in np.flatnonzero(features.any(axis=1))]
         while max(map(len, groups), default=every) <= min(largest, every - 1):
             for number, group in enumerate(groups):
                 if group in self.known:
@@ -177,6 +177,8 @@ class _Work:
                 part = (found.bound or 0.0) * len(group) / every
                 self.known[group] = max(part - SAFETY * (1 + abs(part)), 0.0)
             self.proven = max(self.proven, sum(self.known[group] for group in groups))
+            if len(groups) == 1:
+                return
             groups = _joined(groups, features)
 
     def solve(self, group: Group, until: float, gap: float) -> tuple[Solution, Encoded]:
@@ -228,10 +230,11 @@ def _with(encoded: Encoded, known: dict[Group, float]) -> Program:
 
 
 def _features(params: Params, problem: Problem, free: str) -> Float[np.ndarray, "R I"]:
-    """What goes into the free layer of each row, as unit vectors."""
+    """What goes into the free layer of each row, its bias included, as unit vectors; zeros where nothing does."""
     chain = chain_of(params, problem.scales, problem.situations, free, normalise=problem.normalise)
     sums = [step for step in chain.steps if isinstance(step, Sum)]
-    rows = sums[0].into @ chain.inputs if sums else chain.inputs
+    inputs = np.concatenate([chain.inputs, np.ones((len(chain.inputs), 1))], axis=1)
+    rows = sums[0].into @ inputs if sums else inputs
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
 
 

@@ -11,7 +11,9 @@ import pytest
 from gnn.checkpoint import Model
 from gnn.config import PRESETS
 from gnn.decode import Integrator
+from repair.errors import Status
 from repair.network import Situations
+from repair.weight_box import Polished
 from swarmnet.bench_repair import GAP, Part, Proof, Study, edge_function, last_layer, loop_parts, thesis
 from swarmnet.bench_throughput import AGENTS, EPISODE, bench_throughput
 from swarmnet.cli import main
@@ -84,11 +86,20 @@ def test_proofs_of_repair(study):
     assert svg(gaps([])).startswith("<?xml")
 
 
-def test_boxes_that_took_too_long_are_not_tried_with_more_rows(study):
-    found = list(edge_function(study, 1e-9, rows=(2, 4), boxes=(0.01, 0.02)))
-    assert [isinstance(item, Proof) for item in found] == [True, False, False, False]
-    assert not found[0].proven
-    assert "0.02 is left out from 2 rows on" in found[1]
+def test_boxes_that_took_too_long_are_not_tried_with_more_rows(study, monkeypatch):
+    def unproven(params, problem, *, radius, **_):
+        gap = 0.3 if radius > 0.01 else 0.001
+        size = {"rows": 1, "columns": 1, "binaries": 1, "coefficients": 1}
+        return Polished(
+            params=params, status=Status.FEASIBLE, start=1.0, incumbent=1.0, bound=1 - gap, gap=gap, violated=0,
+            seconds=1.0, nodes=0, size=size,
+        )  # fmt: skip
+
+    monkeypatch.setattr("swarmnet.bench_repair.polish", unproven)
+    found = list(edge_function(study, 1.0, rows=(2, 4), boxes=(0.01, 0.02, 0.05)))
+    assert [isinstance(item, Proof) for item in found] == [True, True, False, True, False, False]
+    assert "0.05 is left out from 2 rows on" in found[2]
+    assert "0.02 is left out from 4 rows on" in found[4]
 
 
 def test_parts_of_a_round(study):

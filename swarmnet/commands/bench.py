@@ -5,6 +5,7 @@ import math
 import re
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -19,13 +20,16 @@ from swarm_mjcf.spec import SceneSpec
 from swarmnet.bench_adapters import bench_adapters
 from swarmnet.bench_engines import bench_engines
 from swarmnet.bench_experts import bench_experts
+from swarmnet.bench_repair import Part, Proof, bench_repair, network
 from swarmnet.bench_rl import PUBLISHED_RATE, bench_rl
 from swarmnet.bench_throughput import bench_throughput
 from swarmnet.bench_train import bench_loop, bench_one_core
 from swarmnet.commands.train import note
 from swarmnet.config import Bench
+from swarmnet.figures import svg
+from swarmnet.figures_gaps import gaps
 from swarmnet.progress import progress
-from swarmnet.results import Results, Row, write_results
+from swarmnet.results import Results, Row, write_results, write_whole
 
 THESIS = {"published_mean 5 steps": 0.2338, "published_mean 40 steps": 2.778}
 """Table 3.1, SwarmNet with context on Boids, after 50K demonstrations."""
@@ -191,6 +195,45 @@ def _train(config: Bench) -> Results:
     return Results(name="bench-train", rows=rows, dt=0.3, seeds=[config.seed])
 
 
+def _repair(config: Bench) -> Results:
+    """Proofs and parts of repair; their figure goes beside the JSON."""
+    rows: list[Row] = []
+    proofs: list[Proof] = []
+    with tempfile.TemporaryDirectory() as folder, progress("train thesis-ch5-small") as update:
+        model = network(config.run, config.seed, config.scenes, Path(folder), update)
+    for found in bench_repair(model, config.seconds):
+        if isinstance(found, str):
+            print(found, flush=True)
+        elif isinstance(found, Part):
+            print(f"repair.loop.{_metric(found.name)}.seconds {found.seconds:.4g}", flush=True)
+            rows.append(Row("parts of the loop, 512 scenes", f"{found.name} seconds", found.seconds, unit="s"))
+        else:
+            proofs.append(found)
+            rows += _proof(found)
+    if config.json:
+        write_whole(config.json.with_suffix(".svg"), svg(gaps(proofs)))
+    return Results(name="bench-repair", rows=rows, dt=model.integrator.dt, seeds=[config.seed])
+
+
+def _proof(found: Proof) -> Iterator[Row]:
+    column = f"R={found.rows} {found.setting}={found.value:g}"
+    where = f"repair.{_metric(found.family)}.r{found.rows}.{found.setting}{found.value:g}"
+    rows, columns = found.size or (None, None)
+    for figure, value, unit in (
+        ("seconds", found.seconds, "s"),
+        ("gap [%]", 100 * found.gap, "%"),
+        ("incumbent", found.incumbent, ""),
+        ("bound", found.bound, ""),
+        ("rows", rows, "1"),
+        ("columns", columns, "1"),
+        ("binaries", found.binaries if found.size else None, "1"),
+        ("rows left violated", found.left if found.size else None, "1"),
+    ):
+        if value is not None:
+            print(f"{where}.{_metric(figure.replace('[%]', 'percent'))} {value:.5g}", flush=True)
+            yield Row(found.family, f"{column} {figure}", value, unit=unit, more={"status": found.status})
+
+
 def _build(config: Bench) -> Results:
     """Seconds for 1000 scenes of 20 agents from specification to compiled model, on one core."""
     begun = time.perf_counter()
@@ -219,6 +262,7 @@ _MEASURES = {
     "imitation": _imitation,
     "train": _train,
     "rl": _rl,
+    "repair": _repair,
     "rendering": _rendering,
     "build": _build,
 }
