@@ -194,6 +194,10 @@ def test_nothing_at_all_stands_at_the_floor():
 def test_the_picture_of_the_table_takes_cells_of_its_own_scenes(tmp_path: Path):
     record = {"minutes": 5.0, "dt": 0.3, "seed": 0, "profile": "cpu", "demonstrations": 2000}
     done = [(Cell(row, "thesis", 0), record | {"values": values}) for row, values in points()]
+    # The expert learns nothing, so its cells know no minutes; they come first.
+    untrained = {name: value for name, value in record.items() if name != "minutes"}
+    expert = untrained | {"values": {"contact steps [%]": 0.03, "goal distance / imitation": 0.96}}
+    done.insert(0, (Cell("expert", "thesis", 0), expert))
     done += [(Cell("imitation", "10 agents", 0), record | {"values": {"10 agents: x": 1.0}})]
     files = draw_6_1(tmp_path, done)
     assert {path.name for path in files} == {"table-6.1.png", "table-6.1.pdf"}
