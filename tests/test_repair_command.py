@@ -198,15 +198,30 @@ def test_damaged_files_are_named(given: Path, copy: Path, capsys):
         (("--polish", "psi/*"), "psi/*"),
         (("--engine", "steam"), "engine: 'steam' was given"),
         (("--num-agents", "0"), "num_agents: 0 was given"),
-        (("--method", "last-layer"), "disc with method last-layer"),
         (("--method", "thesis", "--layers", "nose"), "layers: 'nose' was given"),
-        (("--method", "thesis", "--constraint.name", "disc"), "use polygon, diamond or barrier"),
     ],
 )
 def test_what_makes_no_sense_leaves_nothing_behind(more, said: str, given: Path, tmp_path: Path, capsys):
     run = tmp_path / "never"
     assert said in fails(capsys, "repair", str(given), "--run", str(run), *SMALL[:-2], *more)
     assert not run.exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--method", "last-layer"), "allowed is disc with method last-layer"),
+        (("--method", "thesis", "--constraint.name", "disc"), "barrier or polygon or diamond with method thesis"),
+        (("--price", "nan"), "price: nan was given"),
+        (("--rounds", "-1"), "rounds: -1 was given"),
+    ],
+)
+def test_settings_that_do_not_go_together_end_before_anything_is_read(more, said: str, tmp_path: Path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(("repair", str(tmp_path / "nobody"), "--run", str(tmp_path / "never"), *more))
+    assert ended.value.code == 2
+    assert said in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert not (tmp_path / "never").exists()
 
 
 def test_a_network_that_cannot_be_encoded_is_refused_by_name(tmp_path: Path, capsys):

@@ -358,7 +358,7 @@ def test_presets_are_what_they_say():
     assert PRESETS["thesis-ch3"].output == "state_change"
     assert PRESETS["thesis-ch5"].aggregate == ("sum",)
     assert PRESETS["best"].clip
-    with pytest.raises(SpecError, match="thesis-ch3, thesis-ch3-blind, thesis-ch5, best"):
+    with pytest.raises(SpecError, match="thesis-ch3, thesis-ch3-blind, thesis-ch5, thesis-ch5-small, best"):
         model_preset("GAT")
     with pytest.raises(SpecError, match="window"):
         ModelConfig(window=4, convolutions=(8,))
