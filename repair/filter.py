@@ -65,7 +65,7 @@ def nearest_allowed(
 
 
 def _within(xp: object, vector: Array, limit: float) -> Array:
-    """Shortened to the limit, a hair inside it, so that rounding does not push it out."""
+    """Shortened to the limit."""
     if np.isinf(limit):
         return vector
     size = xp.sqrt(xp.sum(vector * vector, axis=-1, keepdims=True) + 1e-18)  # type: ignore[attr-defined]

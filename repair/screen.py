@@ -80,10 +80,13 @@ def screen(
     kinematics: Kinematics,
 ) -> Screened:
     """Judges decisions by the action that is executed. Unavoidable is who is inside already (its surfaces overlap), or
-    for whom no action within the limits satisfies all conditions."""
+    for whom no action within the limits satisfies all conditions. An action that is not finite breaks every condition:
+    its slack is -inf."""
     e = encounters(situations, bodies)
+    sound = np.isfinite(action).all(axis=1)
+    action = np.where(sound[:, None], action, 0)
     done = executed(situations.own[:, 2:], action, kinematics)
-    slack = least(constraint, e, done)
+    slack = np.where(sound, least(constraint, e, done), -np.inf)
     possible = np.ones(len(situations), bool)
     asked = np.flatnonzero(slack < -TOLERANCE)
     if len(asked):
@@ -94,7 +97,7 @@ def screen(
         possible[asked] = fits & holds
     return Screened(
         slack=slack,
-        before_clip=least(constraint, e, action),
+        before_clip=np.where(sound, least(constraint, e, action), -np.inf),
         possible=possible,
         apart=(gap(e) > 0).all(axis=1) if e.present.shape[1] else np.ones(len(situations), bool),
     )

@@ -4,10 +4,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Float
 
 from envs.dynamics import Kinematics
-from envs.record import Array
 from gnn.family import Params
 from gnn.features import Scales
 from repair.constraints.constraint import Constraint
@@ -52,7 +50,10 @@ class Verification:
             "holds_before_clip": self.holds_before_clip,
             "holds_as_executed": self.holds_as_executed,
         }
-        return found | {"worst": self.worst if np.isfinite(self.worst) else None}
+        return found | {
+            name: value if value is not None and np.isfinite(value) else None
+            for name, value in (("worst", self.worst), ("deviation", self.deviation))
+        }
 
 
 def verify(
@@ -70,11 +71,11 @@ def verify(
 
     An action that is not finite breaks everything.
     """
-    action = _finite(actions(params, scales, situations, normalise=normalise))
+    action = actions(params, scales, situations, normalise=normalise)
     now = screen(constraint, situations, action, bodies, kinematics)
     introduced = mended = deviation = None
     if before is not None:
-        old_action = _finite(actions(before, scales, situations, normalise=normalise))
+        old_action = actions(before, scales, situations, normalise=normalise)
         old = screen(constraint, situations, old_action, bodies, kinematics)
         introduced = int((now.violated & ~old.violated).sum())
         mended = int((old.violated & ~now.violated).sum())
@@ -89,10 +90,6 @@ def verify(
         worst=float(now.slack[now.possible & now.apart].min(initial=np.inf)),
         deviation=deviation,
     )
-
-
-def _finite(action: Float[Array, "R 2"]) -> Float[Array, "R 2"]:
-    return np.where(np.isfinite(action), action, 1e30)
 
 
 def clopper_pearson(hits: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:

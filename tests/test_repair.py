@@ -197,7 +197,6 @@ def test_a_time_limit_of_zero_changes_nothing():
 
 
 def test_screening_tells_avoidable_from_unavoidable():
-    m = model()
     one = approaching(3)
     own = np.array([[0.0, 9.0, 0.0, -6.0], [0.0, 4.3, 0.0, -9.0], [0.0, 3.5, 0.0, -1.0]])
     rows = replace(one, own=own)
@@ -208,7 +207,6 @@ def test_screening_tells_avoidable_from_unavoidable():
     assert found.apart.tolist() == [True, True, False]
     outward = screen(Barrier(kinematics=MOTION), rows, -inward, BODIES, MOTION)
     assert not outward.violated[0]
-    assert m.params is not None
 
 
 def test_decisions_are_those_of_present_agents_in_finite_states():
@@ -243,10 +241,13 @@ def test_verification_counts_what_is_introduced_and_what_is_mended():
 def test_weights_that_are_not_numbers_break_everything():
     m = model()
     m.params["readout"]["layer0"]["bias"][:] = np.nan
-    far = replace(approaching(), own=approaching().own * [10, 10, 0, 0])
-    found = verify(m.params, m.scales, far, Disc(kinematics=MOTION), BODIES, MOTION)
-    assert found.violated_before_clip + found.violated >= 0
-    assert not np.isfinite(actions(m.params, m.scales, far)).any()
+    slow = replace(approaching(), own=approaching().own * [1, 1, 0, 0])  # nobody moves: any action would do
+    still = np.zeros((len(slow), 2))
+    assert not screen(Disc(kinematics=MOTION), slow, still, BODIES, MOTION).violated.any()
+    found = verify(m.params, m.scales, slow, Disc(kinematics=MOTION), BODIES, MOTION)
+    assert (found.violated, found.avoidable, found.violated_before_clip) == (60, 60, 60)
+    assert not found.holds_as_executed
+    assert json.loads(json.dumps(found.plain(), allow_nan=False))["worst"] is None
 
 
 @given(st.integers(0, 40), st.integers(1, 40))
@@ -358,7 +359,6 @@ def test_the_penalty_method_holds_on_to_the_policy_s_own_actions():
     m = model()
     free_of_charge = replace(SMALL, targets="own", polish=(), rounds=1, descent=DescentConfig(steps=250, price=0.0))
     found = repair(m, free_of_charge, BODIES, performing(m))
-    assert found.history[-1]["deviation"] < 1e-2 if "deviation" in found.history[-1] else True
     assert found.history[0]["deviation"] < 1e-2
 
 
