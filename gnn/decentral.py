@@ -1,10 +1,7 @@
 """Decentralised execution: every agent runs its own copy of the network on what it perceives, and on nothing else."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
-import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -14,11 +11,10 @@ from envs.policy import Policy
 from envs.record import Array
 from envs.state import State, make_state
 from gnn.config import AnyModelConfig
-from gnn.decode import make_policy
+from gnn.decode import acting_network
 from gnn.family import Params
 from gnn.features import Scales
-from gnn.graph import EDGE_TYPES
-from gnn.swarmnet import MLP
+from gnn.graph import first_receives, graph_of_state
 
 
 def make_decentralised(
@@ -44,12 +40,11 @@ def make_decentralised(
       SwarmError: the model sees a history or predicts state changes: it has no acceleration to execute.
     """
     sight = Interaction(nearest=nearest, radius=radius)
-    act = make_policy(config, scales, goal=goal)
+    apply = acting_network(config, scales)
 
     def policy(state: State, params: Params, key: object = None) -> Float[Array, "S N 2"]:
-        with nn.intercept_methods(_first_alone):
-            wanted = act(perceived(state, sight), params)
-        return wanted[:, 0].reshape(state.position.shape)
+        nodes, graph = graph_of_state(perceived(state, sight), goal=goal)
+        return apply(params, nodes[:, None], first_receives(graph)).reshape(state.position.shape)
 
     return policy
 
@@ -91,15 +86,3 @@ def perceived(state: State, sight: Interaction) -> State:
         obstacle_present=flat(noticed),
     )
     return replace(alone, step=jnp.repeat(jnp.asarray(state.step), agents))
-
-
-def _first_alone(function: Callable[..., Any], args: Any, kwargs: Any, context: nn.module.InterceptorContext) -> Any:
-    """Edge and node functions of a SwarmNet for the first receiver alone; the others are given its result.
-
-    Only the first agent's action is kept, and XLA does not find out that it need not compute the rest: M + 1 times as
-    many messages.
-    """
-    if not (isinstance(context.module, MLP) and context.module.name in (*EDGE_TYPES, "node")):
-        return function(*args, **kwargs)
-    result = function(*(x[:, :1] for x in args), **kwargs)
-    return jnp.broadcast_to(result, (len(result), args[0].shape[1], *result.shape[2:]))

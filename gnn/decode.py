@@ -92,8 +92,8 @@ def make_predict(config: ModelConfig, scales: Scales, integrator: Integrator) ->
     return predict
 
 
-def make_policy(config: AnyModelConfig, scales: Scales, *, goal: bool = True) -> Policy:
-    """The network as a policy `(state, params, key) -> acceleration (S, N, 2) [m/s^2]` for the environment.
+def acting_network(config: AnyModelConfig, scales: Scales) -> Callable[..., Array]:
+    """`(weights, history (B, 1, V, 4), graph) -> accelerations (B, N, 2) [m/s^2]` of a network that steers.
 
     Raises SwarmError for a model that sees a history or predicts state changes: it has no acceleration to execute.
     """
@@ -102,7 +102,15 @@ def make_policy(config: AnyModelConfig, scales: Scales, *, goal: bool = True) ->
             "a model with a history window or a state-change output (preset thesis-ch3) predicts, it does not act: "
             "physics needs an acceleration from the present state; use preset thesis-ch5 or best"
         )
-    apply = network(config, scales)
+    return network(config, scales)
+
+
+def make_policy(config: AnyModelConfig, scales: Scales, *, goal: bool = True) -> Policy:
+    """The network as a policy `(state, params, key) -> acceleration (S, N, 2) [m/s^2]` for the environment.
+
+    Raises SwarmError for a model that does not steer (`acting_network`).
+    """
+    apply = acting_network(config, scales)
 
     def policy(state: State, params: Params, key: object = None) -> Float[Array, "S N 2"]:
         nodes, graph = graph_of_state(state, goal=goal)

@@ -1,5 +1,7 @@
 """The graph of a swarm: node states in the order goals, obstacles, agents, and typed, masked edges into the agents."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,13 +16,16 @@ EDGE_TYPES = {"goal": GOAL_EDGE, "obstacle": OBSTACLE_EDGE, "agent": AGENT_EDGE}
 
 @record
 class Graph:
-    """Who sends to whom, by type. Receivers are the agents; ghosts (padding) neither send nor receive."""
+    """Who sends to whom, by type. Ghosts (padding) neither send nor receive.
+
+    Receivers are the first N of the M agents: all of them in a scene, one in the view of a single agent (`views`).
+    """
 
     present: Bool[Array, "B V"]
     goal: Bool[Array, "B N G"]
     """Edges goal -> agent, (receiver, sender)."""
     obstacle: Bool[Array, "B N K"]
-    agent: Bool[Array, "B N N"]
+    agent: Bool[Array, "B N M"]
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -66,3 +71,35 @@ def graph_of_state(state: State, *, goal: bool) -> tuple[Float[Array, "S V 4"], 
         agent=here[:, :, None] & here[:, None] & others,
     )
     return nodes, graph
+
+
+def views(nodes: Float[Array, "S V 4"], graph: Graph) -> tuple[Float[Array, "SN V 4"], Graph]:
+    """What each agent sees, as a graph of its own with one receiver: agent i of scene s at s * N + i.
+
+    The receiver comes first among the agents. Where only some agents count, a network on their views computes nothing
+    for the others.
+    """
+    agents = graph.counts[2]
+    first = nodes.shape[1] - agents
+    order = np.array([[i, *(j for j in range(agents) if j != i)] for i in range(agents)])
+
+    def flat(x: Array) -> Array:
+        return x.reshape(-1, *x.shape[2:])
+
+    def rolled(x: Array) -> Array:
+        """Statics as they are, then the agents in each one's order; (S, V, ...) -> (S * N, V, ...)."""
+        statics = jnp.broadcast_to(x[:, None, :first], (len(x), agents, first, *x.shape[2:]))
+        return flat(jnp.concatenate([statics, x[:, first:][:, order]], axis=2))
+
+    each = Graph(
+        present=rolled(graph.present),
+        goal=flat(graph.goal)[:, None],
+        obstacle=flat(graph.obstacle)[:, None],
+        agent=flat(jnp.take_along_axis(graph.agent, order[None], axis=2))[:, None],
+    )
+    return rolled(nodes), each
+
+
+def first_receives(graph: Graph) -> Graph:
+    """The same graph with edges into its first agent alone."""
+    return replace(graph, goal=graph.goal[:, :1], obstacle=graph.obstacle[:, :1], agent=graph.agent[:, :1])

@@ -12,7 +12,7 @@ from envs.record import Array
 from gnn.checkpoint import Model
 from gnn.config import ModelConfig
 from gnn.family import Params
-from gnn.graph import Graph
+from gnn.graph import Graph, views
 from gnn.swarmnet import MLP, SwarmNet
 from swarm_mjcf.errors import SwarmError
 
@@ -28,6 +28,9 @@ class ActorCritic:
     """`(key, observation) -> weights`."""
     apply: Callable[[Params, Any], tuple[Array, Array]]
     """`(weights, observation) -> (mean actions (S, N, A), values (S, N))`."""
+    views: Callable[[Any], Any]
+    """Observation of S scenes with N agents -> S * N observations with one, agent i of scene s at s * N + i: `apply`
+    gives of these what it gives of the scenes."""
     unit: float
     """Size of an action: of the limit that actions are clipped to, say."""
 
@@ -73,7 +76,7 @@ def swarm_actor_critic(model: Model, *, gamma: float, initial_std: float, scratc
         value = readout.apply({"params": params[VALUE]}, embedding)
         return mean, span * jnp.asarray(value)[..., 0]
 
-    return ActorCritic(init, apply, limit)
+    return ActorCritic(init, apply, lambda observation: views(*observation), limit)
 
 
 def network_weights(params: Params) -> Params:

@@ -32,6 +32,9 @@ class PPOConfig:
     """Passes over each rollout."""
     minibatches: int = 4
     """Parts of a pass, by control steps; must divide `steps`."""
+    chunk: int | None = None
+    """Agents whose gradients are computed at once; a minibatch's are sums over chunks. None: 256, which fit a core's
+    cache, on a CPU, and 65536 elsewhere."""
     gamma: float = 0.95
     """Discount per control step."""
     gae_lambda: float = 0.9
@@ -61,6 +64,8 @@ class PPOConfig:
         for field in ("scenes", "steps", "iterations", "epochs", "minibatches"):
             if getattr(self, field) < 1:
                 raise SpecError(field, getattr(self, field), "at least 1")
+        if self.chunk is not None and self.chunk < 1:
+            raise SpecError("chunk", self.chunk, "at least 1, or None")
         if self.steps % self.minibatches:
             raise SpecError("minibatches", self.minibatches, f"a divisor of steps = {self.steps}")
         if self.warmup < 0:

@@ -1,7 +1,8 @@
 """Proximal policy optimisation (Schulman et al. 2017): pure functions from a rollout to new weights.
 
-Every agent that is there is a sample of its own; ghosts, restarts and diverged steps count in nothing. Sums go through
-`total`, so that the same code runs on a part of the scenes per device: the result is that of all of them together.
+Every agent that is there is a sample of its own; ghosts, restarts and diverged steps count in nothing, and networks are
+not run on them. Sums go through `total`, so that the same code runs on a part of the scenes per device: the result is
+that of all of them together.
 """
 
 from collections.abc import Callable
@@ -28,23 +29,37 @@ ADVANTAGE_EPS = 1e-8
 
 @record
 class Samples:
-    """What the update needs of a rollout; time first."""
+    """What the update needs of a rollout (time first), or of its agents one by one (`by_agent`)."""
 
     observation: Observation
-    action: Float[Array, "T S N A"]
-    log_prob: Float[Array, "T S N"]
-    advantage: Float[Array, "T S N"]
-    target: Float[Array, "T S N"]
+    action: Float[Array, "*n A"]
+    log_prob: Float[Array, "*n"]
+    advantage: Float[Array, "*n"]
+    target: Float[Array, "*n"]
     """Of the value: advantage + value."""
-    counts: Bool[Array, "T S N"]
+    counts: Bool[Array, "*n"]
     """Agents that are there, in rows that are experience."""
-    anchor: Float[Array, "T S N A"]
+    anchor: Float[Array, "*n A"]
     """The first policy's actions, which imitation weight keeps near to."""
 
 
 @record
+class Units:
+    """What a minibatch's samples are measured by, over all devices."""
+
+    number: Float[Array, ""]
+    """Of samples that count."""
+    centre: Float[Array, ""]
+    """Mean advantage [reward]."""
+    deviation: Float[Array, ""]
+    """Of the advantages [reward]."""
+    spread: Float[Array, ""]
+    """Variance of the rollout's targets [reward^2], the unit of the value's error."""
+
+
+@record
 class Losses:
-    """Terms of an update, means over samples."""
+    """Terms of an update: shares of the means over a minibatch's samples, which add up to them."""
 
     policy: Float[Array, ""]
     value: Float[Array, ""]
@@ -85,42 +100,66 @@ def mean_and_variance(x: Array, counts: Bool[Array, "..."], total: Total = alone
     return mean, total(jnp.where(counts, (x - mean) ** 2, 0).sum()) / number
 
 
+def units(part: Samples, spread: Float[Array, ""], total: Total = alone) -> Units:
+    """Of a minibatch: advantages are normalised over its samples."""
+    centre, variance = mean_and_variance(part.advantage, part.counts, total)
+    number = jnp.maximum(total(part.counts.sum()), 1).astype(jnp.float32)
+    return Units(number=number, centre=centre, deviation=jnp.sqrt(variance) + ADVANTAGE_EPS, spread=spread + 1e-6)
+
+
+def by_agent(actor: ActorCritic, part: Samples) -> Samples:
+    """A sample for every agent, (T S N, 1, ...), those that count before all others."""
+    count = part.counts.size
+    scenes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), part)
+    rest = {name: x.reshape(count, 1, *x.shape[2:]) for name, x in vars(scenes).items() if name != "observation"}
+    order = jnp.argsort(~part.counts.reshape(count))
+    return jax.tree.map(lambda x: x[order], Samples(observation=actor.views(scenes.observation), **rest))
+
+
 def losses(
-    actor: ActorCritic,
-    params: Params,
-    part: Samples,
-    config: PPOConfig,
-    *,
-    spread: Float[Array, ""],
-    total: Total = alone,
+    actor: ActorCritic, params: Params, samples: Samples, config: PPOConfig, units: Units
 ) -> tuple[Array, Losses]:
-    """This device's share of the objective, and its terms. Advantages are normalised over the part's samples.
+    """The objective and its terms: what these samples contribute to the minibatch of which `units` are. (S, N, ...)"""
+    mean, value = actor.apply(params, samples.observation)
 
-    `spread`: variance of the targets [reward^2], the unit of the value's error.
-    """
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), part)
-    mean, value = actor.apply(params, flat.observation)
-    number = jnp.maximum(total(flat.counts.sum()), 1)
+    def share(x: Array) -> Array:
+        return jnp.where(samples.counts, x, 0).sum() / units.number
 
-    def average(x: Array) -> Array:
-        return jnp.where(flat.counts, x, 0).sum() / number
-
-    centre, variance = mean_and_variance(flat.advantage, flat.counts, total)
-    advantage = (flat.advantage - centre) / (jnp.sqrt(variance) + ADVANTAGE_EPS)
-    log_ratio = jnp.where(flat.counts, log_probability(mean, params[STD], flat.action) - flat.log_prob, 0)
+    advantage = (samples.advantage - units.centre) / units.deviation
+    log_ratio = log_probability(mean, params[STD], samples.action) - samples.log_prob
+    log_ratio = jnp.where(samples.counts, log_ratio, 0)
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-    away = jnp.sum(((mean - flat.anchor) / actor.unit) ** 2, axis=-1)
+    away = jnp.sum(((mean - samples.anchor) / actor.unit) ** 2, axis=-1)
     terms = Losses(
-        policy=-average(jnp.minimum(ratio * advantage, clipped * advantage)),
-        value=0.5 * average((value - flat.target) ** 2) / (spread + 1e-6),
-        entropy=average(jnp.broadcast_to(entropy(params[STD]), flat.counts.shape)),
-        imitation=average(away),
-        kl=average(ratio - 1 - log_ratio),
-        clip_fraction=average(jnp.abs(ratio - 1) > config.clip),
+        policy=-share(jnp.minimum(ratio * advantage, clipped * advantage)),
+        value=0.5 * share((value - samples.target) ** 2) / units.spread,
+        entropy=share(jnp.broadcast_to(entropy(params[STD]), samples.counts.shape)),
+        imitation=share(away),
+        kl=share(ratio - 1 - log_ratio),
+        clip_fraction=share(jnp.abs(ratio - 1) > config.clip),
     )
     objective = terms.policy + config.value_weight * terms.value - config.entropy_weight * terms.entropy
     return objective + config.imitation_weight * terms.imitation, terms
+
+
+def gradient(
+    actor: ActorCritic, params: Params, part: Samples, config: PPOConfig, units: Units
+) -> tuple[Params, Losses]:
+    """Of the objective, and its terms: sums over chunks of this device's agents. Ghosts cost nothing, as there are only
+    as many passes as it takes for those that count."""
+    count = part.counts.size
+    size = min(config.chunk or (256 if jax.default_backend() == "cpu" else 65536), count)
+    agents = jax.tree.map(lambda x: jnp.pad(x, [(0, -count % size)] + [(0, 0)] * (x.ndim - 1)), by_agent(actor, part))
+
+    def add(number: Array, sums: tuple[Params, Losses]) -> tuple[Params, Losses]:
+        chunk = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, number * size, size), agents)
+        found = jax.grad(lambda params: losses(actor, params, chunk, config, units), has_aux=True)(params)
+        return jax.tree.map(jnp.add, sums, found)
+
+    nothing = Losses(**dict.fromkeys(Losses.__annotations__, jnp.zeros((), jnp.float32)))
+    passes = (part.counts.sum() + size - 1) // size
+    return jax.lax.fori_loop(0, passes, add, (jax.tree.map(jnp.zeros_like, params), nothing))
 
 
 def make_optimizer(mask: Mask, config: PPOConfig) -> optax.GradientTransformation:
@@ -166,19 +205,16 @@ def update(
     def one(carry: tuple[Params, Any, Array], chosen: Array):
         params, opt_state, stop = carry
         part = jax.tree.map(lambda x: x[chosen], samples)
-        gradient, terms = jax.grad(
-            lambda params: losses(actor, params, part, config, spread=spread, total=total), has_aux=True
-        )(params)
-        gradient, terms = jax.tree.map(total, (gradient, terms))
+        found, terms = jax.tree.map(total, gradient(actor, params, part, config, units(part, spread, total)))
         stop |= (terms.kl > config.target_kl) & ~warm
-        step: Any = optimizer.update(gradient, opt_state, params)
+        step: Any = optimizer.update(found, opt_state, params)
         updates, after = step
         moved: Any = optax.apply_updates(params, updates)
         frozen_actor = {name: moved[name] if name == VALUE else part for name, part in params.items()}
         held = after._replace(inner_states=after.inner_states | {"actor": opt_state.inner_states["actor"]})
         new, state = _choose(warm, (frozen_actor, held), (moved, after))
         params, opt_state = _choose(stop, (params, opt_state), (new, state))
-        return (params, opt_state, stop), (terms, optax.tree.norm(free_leaves(gradient, mask)), stop)
+        return (params, opt_state, stop), (terms, optax.tree.norm(free_leaves(found, mask)), stop)
 
     (params, opt_state, _), (terms, norms, stops) = jax.lax.scan(one, (params, opt_state, jnp.zeros((), bool)), order)
     done = ~stops

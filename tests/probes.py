@@ -79,7 +79,7 @@ def probe_actor() -> ActorCritic:
             ..., 0
         ]
 
-    return ActorCritic(init, apply, 1.0)
+    return ActorCritic(init, apply, lambda observation: observation.reshape(-1, 1, 1), 1.0)
 
 
 class Plain:

@@ -17,7 +17,7 @@ from rl.actor_critic import entropy, log_probability
 from rl.collect import collect, start
 from rl.config import MODES, PPOConfig
 from rl.gae import gae
-from rl.ppo import losses, make_optimizer, make_samples, mean_and_variance
+from rl.ppo import by_agent, gradient, losses, make_optimizer, make_samples, mean_and_variance, units
 from rl.train import make_learner
 from swarm_mjcf.errors import SpecError
 
@@ -149,11 +149,16 @@ def samples_of(config=FAST):
     return actor, params, rollout, make_samples(rollout, rollout.mean, config)
 
 
+def terms_of(actor, params, samples, config):
+    """Of a whole rollout as one minibatch."""
+    return losses(actor, params, by_agent(actor, samples), config, units(samples, jnp.float32(1)))
+
+
 def test_the_first_gradient_is_the_policy_gradient_whatever_the_clip():
     """At the policy that acted the ratio is 1: the gradient is that of mean(advantage * log probability)."""
     actor, params, _, samples = samples_of()
     config = PPOConfig(**{**vars(FAST), "value_weight": 0.0})
-    found = jax.grad(lambda p: losses(actor, p, samples, config, spread=jnp.float32(1))[0])(params)
+    found = jax.grad(lambda p: terms_of(actor, p, samples, config)[0])(params)
 
     def plain(params):
         mean, _ = actor.apply(params, samples.observation)
@@ -175,7 +180,7 @@ def test_clipped_ratios_have_no_gradient():
         tilted = type(samples)(**{**vars(samples), "log_prob": samples.log_prob - 1.0})
         which = samples.advantage * direction > 0
         tilted = type(samples)(**{**vars(tilted), "counts": samples.counts & which})
-        terms = losses(actor, params, tilted, config, spread=jnp.float32(1))[1]
+        terms = terms_of(actor, params, tilted, config)[1]
         assert float(terms.clip_fraction) == 1
         np.testing.assert_allclose(float(terms.kl), np.e - 2, rtol=1e-5)
 
@@ -196,11 +201,7 @@ def test_ghosts_and_rows_without_experience_count_in_nothing():
     config = PPOConfig(**{**vars(FAST), "entropy_weight": 0.1, "imitation_weight": 0.1})
     for one, other in zip(
         *(
-            jax.tree.leaves(
-                jax.value_and_grad(lambda p, s=s: losses(actor, p, s, config, spread=jnp.float32(1)), has_aux=True)(
-                    params
-                )
-            )
+            jax.tree.leaves(jax.value_and_grad(lambda p, s=s: terms_of(actor, p, s, config), has_aux=True)(params))
             for s in (samples, spoiled)
         ),
         strict=True,
@@ -208,6 +209,25 @@ def test_ghosts_and_rows_without_experience_count_in_nothing():
         np.testing.assert_array_equal(one, other)
     # Restarts follow the rows that ended, and only they.
     np.testing.assert_array_equal(~rollout.valid[1:], rollout.ended[:-1])
+
+
+@pytest.mark.parametrize("chunk", [1, 100, 384, 10_000])
+def test_the_gradient_is_the_sum_over_chunks_of_those_that_count(chunk):
+    """Beside the gradient of the whole at once; some of the last chunk's places are empty."""
+    actor, params, _, samples = samples_of()
+    config = PPOConfig(**{**vars(FAST), "entropy_weight": 0.1, "imitation_weight": 0.1, "chunk": chunk})
+    found, terms = jax.jit(lambda p: gradient(actor, p, samples, config, units(samples, jnp.float32(1))))(params)
+    whole, whole_terms = jax.grad(lambda p: terms_of(actor, p, samples, config), has_aux=True)(params)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), (found, terms), (whole, whole_terms))
+
+
+def test_agents_that_count_come_first_each_with_what_is_its_own():
+    actor, _, _, samples = samples_of()
+    agents, counts = by_agent(actor, samples), np.asarray(samples.counts)
+    assert (np.asarray(agents.counts)[:, 0] == (np.arange(counts.size) < counts.sum())).all()
+    for name in ("action", "target", "observation"):
+        own = np.asarray(getattr(samples, name))[counts]
+        np.testing.assert_array_equal(np.asarray(getattr(agents, name))[: counts.sum(), 0], own)
 
 
 def test_normalised_advantages_have_mean_0_and_variance_1():

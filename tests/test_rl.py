@@ -78,6 +78,10 @@ def test_the_mean_action_is_the_imitated_one_and_the_value_is_another_readout():
         np.testing.assert_allclose(mean, imitated, atol=1e-5)
         assert value.shape == mean.shape[:2]
         same(network_weights(params), model(preset).params)
+        here = np.asarray(state.agent_present)
+        assert not here.all()
+        for whole, each in zip((mean, value), apply(params, actor.views(observation)), strict=True):
+            np.testing.assert_allclose(each.reshape(whole.shape)[here], whole[here], atol=1e-5)
         np.testing.assert_allclose(params[STD], np.log(0.2 * task().env.spec.max_acceleration), rtol=1e-6)
         other = params | {VALUE: jax.tree.map(lambda x: x + 1, params[VALUE])}
         moved_mean, moved_value = apply(other, observation)
