@@ -75,6 +75,7 @@ def collect(
     apart = jnp.uint32(_NOISE) + iteration.astype(jnp.uint32)
     draw = jax.vmap(partial(jax.random.fold_in, jax.random.fold_in(jax.random.key(config.seed), apart)))
     keys = draw(runner.slot)
+    ends = config.terminations is None or iteration < config.terminations
 
     def step(runner: Runner, t: Array):
         seen, here = task.observe(runner.world), task.present(runner.world)
@@ -84,8 +85,8 @@ def collect(
         outcome = task.step(runner.world, action)
         again = runner.over
         sick = outcome.diverged & ~again
-        terminated = outcome.terminated & ~again & ~sick
-        ended = (outcome.terminated | outcome.truncated | outcome.diverged) & ~again
+        terminated = outcome.terminated & ends & ~again & ~sick
+        ended = terminated | (outcome.truncated | outcome.diverged) & ~again
         valid = ~again & ~sick
         counts = valid[:, None] & here
         gained = runner.gained + jnp.where(counts, outcome.reward, 0).sum(axis=1) / jnp.maximum(here.sum(axis=1), 1)

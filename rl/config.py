@@ -28,6 +28,10 @@ class PPOConfig:
     """Rollouts with an update each."""
     warmup: int = 8
     """First iterations, in which the value's readout alone learns."""
+    terminations: int | None = None
+    """First iterations in which a scene that the task ends (at a contact, with `terminate_on_contact`) is over; from
+    then on all go on to the horizon, and the value's readout learns alone for another `warmup`. None: in all. An end
+    at the contact tells clearly what was wrong; then a policy must still learn to come away from what it touches."""
     epochs: int = 2
     """Passes over each rollout."""
     minibatches: int = 4
@@ -68,8 +72,9 @@ class PPOConfig:
             raise SpecError("chunk", self.chunk, "at least 1, or None")
         if self.steps % self.minibatches:
             raise SpecError("minibatches", self.minibatches, f"a divisor of steps = {self.steps}")
-        if self.warmup < 0:
-            raise SpecError("warmup", self.warmup, "at least 0")
+        for field in ("warmup", "terminations"):
+            if (getattr(self, field) or 0) < 0:
+                raise SpecError(field, getattr(self, field), "at least 0")
         for field in ("gamma", "gae_lambda"):
             if not 0 <= getattr(self, field) <= 1:
                 raise SpecError(field, getattr(self, field), "from 0 to 1")

@@ -191,8 +191,8 @@ def update(
     """Epochs of minibatches: `(weights, optimizer state, metrics)`.
 
     A minibatch is the same share of control steps of every scene, so it does not depend on how scenes are spread over
-    devices. During the first `warmup` iterations the value's readout alone moves. Once the policy has moved by
-    `target_kl`, the rest of the update is passed over.
+    devices. During the first `warmup` iterations, and those after the last of `terminations`, the value's readout alone
+    moves. Once the policy has moved by `target_kl`, the rest of the update is passed over.
     """
     rows = config.steps // config.minibatches
     key = jax.random.fold_in(jax.random.key(config.seed + 1), iteration)
@@ -201,6 +201,9 @@ def update(
     ).reshape(-1, rows)
     _, spread = mean_and_variance(samples.target, samples.counts, total)
     warm = iteration < config.warmup
+    if config.terminations:
+        later = iteration - config.terminations
+        warm |= (later >= 0) & (later < config.warmup)
 
     def one(carry: tuple[Params, Any, Array], chosen: Array):
         params, opt_state, stop = carry

@@ -2,7 +2,8 @@
 
 The floor is the floating-point operations of the networks of one env-step (one pass forward while acting; forward and
 backward, three passes, in every epoch), as XLA counts them, by the machine's rate of matrix products measured in this
-run. Masked edges and ghosts are computed and counted: every graph has the room of the largest.
+run; physics is in no floor. Every graph has the room of the largest: `floor` counts ghosts too, as they are computed
+while acting, `lean_floor` only agents that are there, on which the update runs (their ghost senders are counted).
 """
 
 import time
@@ -56,6 +57,8 @@ class Speed:
     """Both, as trained [1/s]."""
     floor: float
     """What the arithmetic alone would allow [1/s]."""
+    lean_floor: float
+    """Without that of ghosts [1/s]."""
     operations: float
     """Floating-point operations of the networks per env-step [1]."""
 
@@ -100,6 +103,7 @@ def _measure(name: str, network: ModelConfig, config: PPOConfig, engine: str, ra
         update=per_call / seconds_of(lambda: learned(state["params"])),
         training=per_call / seconds_of(lambda: learner.iterate(state)),
         floor=rate / operations,
+        lean_floor=rate / operations / float(samples.counts.mean()),
         operations=operations,
     )
 

@@ -78,7 +78,8 @@ class RL(PPOConfig):
     horizon: int = 60
     """Control steps per episode."""
     terminate_on_contact: bool = False
-    """End an episode at any contact; otherwise a contact costs and the scene goes on."""
+    """End an episode at any contact (--terminations: in the first iterations); otherwise a contact costs and the scene
+    goes on."""
     reward: RewardConfig = field(default_factory=RewardConfig)
     """Coefficients of the reward."""
     engine: str = "auto"
@@ -100,6 +101,8 @@ class RL(PPOConfig):
         super().__post_init__()
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise SpecError("minutes", self.minutes, "a finite number above 0")
+        if self.terminations is not None and not self.terminate_on_contact:
+            raise SpecError("terminations", self.terminations, "none without --terminate-on-contact")
         for name, least in (("horizon", 1), ("test_scenes", 0), ("videos", 0)):
             if getattr(self, name) < least:
                 raise SpecError(name, getattr(self, name), f"at least {least}")

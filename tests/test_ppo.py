@@ -1,6 +1,7 @@
 """PPO on tasks with known answers, and each of its parts against numbers by hand or a second implementation."""
 
 from functools import cache
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +104,19 @@ def test_the_value_alone_learns_while_it_warms_up():
     assert moved["log_std"] < 1.5 * config.learning_rate * config.epochs * config.minibatches
 
 
+def test_the_value_alone_learns_again_when_contacts_no_longer_end_episodes():
+    config = PPOConfig(**{**vars(FAST), "warmup": 2, "terminations": 3})
+    learner = make_learner(Probe(lambda sign, action, last: action[..., 0]), probe_actor(), config)
+    states = [learner.start()]
+    for _ in range(6):
+        states.append(learner.iterate(states[-1])[0])
+    moved = [
+        not np.array_equal(*(state["params"]["mean"]["layer0"]["kernel"] for state in pair))
+        for pair in pairwise(states)
+    ]
+    assert moved == [False, False, True, False, False, True]
+
+
 def test_gae_by_hand():
     """gamma 0.9, lambda 0.5; the second of three steps is truncated: it takes the value of its last observation."""
     reward, value = jnp.asarray([1.0, 2.0, 3.0]), jnp.asarray([0.5, 1.0, 4.0, 2.0])
@@ -112,6 +126,15 @@ def test_gae_by_hand():
     np.testing.assert_allclose(found, [1 + 0.9 - 0.5 + 0.45 * second, second, last], rtol=1e-6)
     terminated = gae(reward, value, jnp.asarray([0.9, 0.0, 0.9]), follows, 0.5)
     np.testing.assert_allclose(terminated[1], 2 - 1, rtol=1e-6)
+
+
+def test_gae_is_that_of_rlax():
+    """What rlax 0.1.9 gives: truncated_generalized_advantage_estimation(reward, discount, 0.9 * follows, value)."""
+    reward, value = [1.0, -0.5, 2.0, 0.25, -1.0, 0.75], [0.5, 1.5, -1.0, 0.75, 2.0, -0.25, 1.25]
+    discount, follows = 0.95 * jnp.asarray([1.0, 1, 0, 1, 1, 1]), jnp.asarray([True, True, False, True, False, True])
+    found = gae(jnp.asarray(reward), jnp.asarray(value), discount, follows, 0.9)
+    its = [1.5958248376846313, -0.38500016927719116, 3.0, -1.3680622577667236, -3.237499952316284, 2.1875]
+    np.testing.assert_allclose(found, its, rtol=1e-6)
 
 
 @settings(max_examples=25)
@@ -277,7 +300,16 @@ def test_one_compile_for_all_iterations():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("scenes", 0), ("minibatches", 7), ("gamma", 1.5), ("clip", 0.0), ("learning_rate", float("nan")), ("warmup", -1)],
+    [
+        ("scenes", 0),
+        ("minibatches", 7),
+        ("gamma", 1.5),
+        ("clip", 0.0),
+        ("learning_rate", float("nan")),
+        ("warmup", -1),
+        ("terminations", -1),
+        ("chunk", 0),
+    ],
 )
 def test_absurd_settings_are_refused_by_name(field, value):
     with pytest.raises(SpecError, match=field):

@@ -93,6 +93,23 @@ def test_the_mean_action_is_the_imitated_one_and_the_value_is_another_readout():
     assert not np.allclose(*kernels)
 
 
+def test_contacts_end_episodes_in_the_first_iterations_alone():
+    config = replace(CONFIG, steps=6, terminations=2)
+    actor, here = swarm_actor_critic(model(), gamma=0.9, initial_std=0.2), task(terminate=True)
+    runner = start(here, config, jnp.arange(config.scenes))
+    params = actor.init(jax.random.key(1), here.observe(runner.world))
+    found = jax.jit(lambda number: collect(here, actor, params, runner, config, number)[1])
+    first, later = found(jnp.int32(1)), found(jnp.int32(2))
+    touched = np.asarray(first.measures["contact_events"]).any(axis=2)
+    assert touched.any()
+    assert not touched.all()
+    np.testing.assert_array_equal(first.terminated, touched & first.valid)
+    assert not later.terminated.any()
+    assert np.asarray(later.measures["contact_events"]).any()
+    # All started together, and nothing else ends an episode before the horizon.
+    np.testing.assert_array_equal(later.ended, np.broadcast_to(np.arange(6)[:, None] == 5, (6, 6)))
+
+
 def test_a_model_that_does_not_steer_is_refused():
     historic = replace(model(), config=tiny("thesis-ch3"))
     for other in (historic, replace(model(), config=tiny("separable"))):

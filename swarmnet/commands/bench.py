@@ -127,6 +127,7 @@ def _rl(config: Bench) -> Results:
             ("training env-steps/s", cell.training, "1/s", PUBLISHED_RATE),
             ("training ratio to engine", cell.training / cell.engine, "1", None),
             ("floor over training", cell.floor / cell.training, "1", None),
+            ("floor without ghosts over training", cell.lean_floor / cell.training, "1", None),
             ("operations per env-step", cell.operations, "1", None),
         )
         for figure, value, unit, reference in figures:
