@@ -94,12 +94,13 @@ def first_of_rows[R: Mapping](done: Sequence[tuple[Cell, R]]) -> dict[str, tuple
     return found
 
 
-def small_print(record: Mapping, *, data: str = "", seeds: Sequence[int] = ()) -> str:
-    """What a network had: demonstrations (or what `data` says), minutes, dt, seed. A smoke run says that it is one."""
+def small_print(record: Mapping, *, data: str = "", effort: str = "", seeds: Sequence[int] = ()) -> str:
+    """What a network had: demonstrations and minutes (or what `data` and `effort` say), dt, seed. A smoke run says that
+    it is one."""
     chosen = list(seeds) or [record["seed"]]
     words = [
         data or f"{record['demonstrations']} demonstrations",
-        f"{record['minutes']:.3g} min of training",
+        effort or f"{record['minutes']:.3g} min of training",
         f"dt {record['dt']:g} s",
         ("seeds " if len(chosen) > 1 else "seed ") + ", ".join(map(str, chosen)),
     ]

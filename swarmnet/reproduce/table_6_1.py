@@ -322,7 +322,8 @@ def draw_6_1(folder: Path, done: Sequence[tuple[Cell, dict]]) -> list[Path]:
     if not points or not trained:
         return []
     seeds = sorted({cell.seed for cell, _ in done})
-    words = small_print(trained[0], data=f"imitation from {DEMONSTRATIONS} demonstrations", seeds=seeds)
+    data, effort = f"imitation from {DEMONSTRATIONS} demonstrations", f"{sum(TRAINING.stage_steps)} gradient steps"
+    words = small_print(trained[0], data=data, effort=effort, seeds=seeds)
     return write(folder, "table-6.1", pareto(points, TOUCHING, (DEVIATION, AWAY), note=words))
 
 
