@@ -6,10 +6,8 @@ run; physics is in no floor. Every graph has the room of the largest: `floor` co
 while acting, `lean_floor` only agents that are there, on which the update runs (their ghost senders are counted).
 """
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +25,7 @@ from rl.config import PPOConfig
 from rl.ppo import make_optimizer, make_samples, update
 from rl.task import SwarmTask
 from rl.train import make_learner
+from swarmnet.arithmetic import matrix_rate, operations, seconds_of
 
 SIZES: dict[str, ModelConfig] = {
     "thesis-ch5": PRESETS["thesis-ch5"],
@@ -35,10 +34,6 @@ SIZES: dict[str, ModelConfig] = {
 """Networks: the preset, and that of the published code, whose edge functions have two layers of 128."""
 PUBLISHED_RATE = 46.0
 """Env-steps per CPU-second of the author's PPO, learning included, on one core like the one it was measured on."""
-SECONDS = 6.0
-"""Each figure is measured for about that long."""
-SIDE = 1024
-"""Of the square matrices whose product is the machine's rate."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +88,7 @@ def _measure(name: str, network: ModelConfig, config: PPOConfig, engine: str, ra
         )
     )  # fmt: skip
     seen = jax.tree.map(lambda x: x[0], rollout.observation)
-    counted: Any = jax.jit(actor.apply).lower(state["params"], seen).compile().cost_analysis()
-    operations = counted["flops"] / config.scenes * (1 + 3 * config.epochs)
+    per_step = operations(actor.apply, state["params"], seen) / config.scenes * (1 + 3 * config.epochs)
     return Speed(
         network=name,
         scenes=config.scenes,
@@ -102,9 +96,9 @@ def _measure(name: str, network: ModelConfig, config: PPOConfig, engine: str, ra
         rollout=per_call / seconds_of(lambda: rolled(state["runner"])),
         update=per_call / seconds_of(lambda: learned(state["params"])),
         training=per_call / seconds_of(lambda: learner.iterate(state)),
-        floor=rate / operations,
-        lean_floor=rate / operations / float(samples.counts.mean()),
-        operations=operations,
+        floor=rate / per_step,
+        lean_floor=rate / per_step / float(samples.counts.mean()),
+        operations=per_step,
     )
 
 
@@ -121,24 +115,6 @@ def untrained(env: SwarmEnv, config: ModelConfig) -> Model:
     params = network_init(config, scales)(jax.random.key(0), nodes[:, None], graph)
     integrator = Integrator(spec.dt, spec.substeps, spec.max_speed, spec.max_acceleration)
     return Model(config, scales, integrator, params, {"preset": "thesis-ch5"})
-
-
-def matrix_rate() -> float:
-    """Floating-point operations per second of a product of square matrices, float32 [1/s]."""
-    one = jnp.ones((SIDE, SIDE), jnp.float32)
-    product = jax.jit(lambda a: a @ a)
-    return 2 * SIDE**3 / seconds_of(lambda: product(one))
-
-
-def seconds_of(call: Callable[[], Any]) -> float:
-    """Seconds of one call, the fastest of as many as fit into `SECONDS`; the first, which compiles, does not count."""
-    jax.block_until_ready(call())
-    best, begun = float("inf"), time.perf_counter()
-    while time.perf_counter() - begun < SECONDS:
-        before = time.perf_counter()
-        jax.block_until_ready(call())
-        best = min(best, time.perf_counter() - before)
-    return best
 
 
 def _nothing(edges: jax.Array) -> tuple[jax.Array, jax.Array]:

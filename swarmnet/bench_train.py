@@ -1,7 +1,8 @@
 """Training speed: windows per second, the share of time in the compiled step, and one core against Keras.
 
 The comparison trains the same sizes (thesis-ch3: Conv1D over 5 rows, edge functions and node function 64-64, batch 128,
-one predicted step) on the same windows, each in a process of its own that is bound to one core.
+one predicted step) on the same windows, each in a process of its own that is bound to one core. Beside it stands what
+the core's rate of matrix products would allow for the gradient alone.
 """
 
 import importlib
@@ -16,13 +17,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs.config import SimulateConfig
 from envs.simulate import simulate_in_memory
 from envs.trajectories import Trajectories
-from gnn.config import TrainConfig
+from gnn.config import PRESETS, TrainConfig
+from gnn.decode import network
 from gnn.train import prepare, train_prepared
+from gnn.windows import windows
+from swarmnet.arithmetic import matrix_rate, operations
 
 WINDOW, BATCH, WIDTH = 5, 128, 64
 SCENES, SECONDS = 200, 10.0
@@ -72,8 +77,8 @@ def bench_loop(config: TrainConfig, trajectories: Trajectories) -> TrainRate:
 
 
 def bench_one_core(seed: int = 0) -> Iterator[TrainRate | str]:
-    """Ours and Keras's on one core each, in turn. Where Keras is not installed, a line that says so."""
-    for case in ("swarmnet", "keras"):
+    """What arithmetic allows, ours and Keras's on one core each. Where Keras is not installed, a line that says so."""
+    for case in ("arithmetic", "swarmnet", "keras"):
         if case == "keras" and importlib.util.find_spec("keras") is None:
             yield "keras is not installed: `pip install tensorflow-cpu` to compare with it"
             return
@@ -98,6 +103,17 @@ def swarmnet_rate(trajectories: Trajectories) -> float:
         state, _, _ = jax.block_until_ready(prepared.run_chunk(state, prepared.data, config.steps, horizon=1))
         chunks += 1
     return chunks * config.chunk * BATCH / (time.perf_counter() - begun)
+
+
+def arithmetic_rate(trajectories: Trajectories) -> float:
+    """Windows per second at which the core would do the floating-point operations of the gradient, and nothing else."""
+    model, prepared = PRESETS["thesis-ch3"], prepare(TrainConfig(model="thesis-ch3"), trajectories)
+    params, zero = prepared.start()["params"], jnp.zeros(BATCH, jnp.int32)
+    counts = trajectories.counts
+    history, _, _, graph = windows(prepared.data, zero, zero, window=model.window, horizon=1, counts=counts)
+    apply = network(model, prepared.scales)
+    gradient = jax.grad(lambda params: jnp.sum(apply(params, history, graph) ** 2))
+    return BATCH * matrix_rate() / operations(gradient, params)
 
 
 def keras_rate(trajectories: Trajectories) -> float:
@@ -159,5 +175,5 @@ def keras_model(counts: tuple[int, int, int]) -> Any:
 
 
 if __name__ == "__main__":
-    rate = {"swarmnet": swarmnet_rate, "keras": keras_rate}[sys.argv[1]]
+    rate = {"arithmetic": arithmetic_rate, "swarmnet": swarmnet_rate, "keras": keras_rate}[sys.argv[1]]
     print(json.dumps(rate(demonstrations(int(sys.argv[2])))))

@@ -7,6 +7,8 @@ from pathlib import Path
 # The CPU gives the same numbers everywhere, at full precision; a machine with an accelerator sets JAX_PLATFORMS itself.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+# Compiling is two thirds of the suite's time, and tests compile much and run little; 0 tests what users run, slowly.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 from hypothesis import settings
 
