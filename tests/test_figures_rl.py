@@ -272,10 +272,11 @@ def test_a_cell_from_demonstrations_to_the_figure(tmp_path, small):
 
 
 def test_what_the_rows_are_trained_with(tmp_path, small, monkeypatch):
-    asked = {}
+    asked, ends = {}, {}
 
     def improve(config, task, model, folder, **how):
         asked[folder.parts[-3]] = (config.freeze, config.seed, how["scratch"], how["minutes"], task.env.horizon)
+        ends[folder.parts[-3]] = task.env.terminate_on_contact and config.terminations
         how["progress"](1, 2, {"spent": 30.0})
         return model
 
@@ -289,8 +290,11 @@ def test_what_the_rows_are_trained_with(tmp_path, small, monkeypatch):
         told.append((done, total))
 
     policies = figures_5.Policies("10k", 3, effort, tmp_path, tell)
-    began = {row: policies.improved(row).about["from"] for row in figures_5.FREEZE}
-    assert began == {"scratch": "1k", "mode 0": "10k", "mode 1": "10k", "mode 2": "10k"}
+    began = {row: policies.improved(row).about["from"] for row in figures_5.TRAINED}
+    always, never = "mode 0, always to contact", "mode 0, always past contact"
+    assert began == {"scratch": "1k"} | dict.fromkeys(("mode 0", "mode 1", "mode 2", always, never), "10k")
+    assert (ends["mode 0"], ends["scratch"], ends[always], ends[never]) == (400, 400, None, 0)
+    assert asked.pop(always) == asked.pop(never) == asked["mode 0"]
     assert asked["scratch"] == ((), 3, True, 2.0, 5)
     assert {row: how[0] for row, how in asked.items()} == {"scratch": ()} | {f"mode {k}": MODES[k] for k in range(3)}
     assert told[0] == (30, 120)

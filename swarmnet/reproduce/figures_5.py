@@ -62,6 +62,9 @@ IMITATED, SCRATCH = "imitation", "scratch"
 FREEZE = {SCRATCH: MODES[0]} | {f"mode {mode}": patterns for mode, patterns in MODES.items()}
 """What stays as it is in the rows that PPO trains."""
 ROWS = (EXPERT, IMITATED, *FREEZE)
+TERMINATIONS = {"mode 0, always to contact": None, "mode 0, always past contact": 0}
+"""Rows beside mode 0 for whether contacts end episodes (`PPOConfig.terminations`)."""
+TRAINED = FREEZE | dict.fromkeys(TERMINATIONS, MODES[0])
 TOUCHING, EVENTS, EVER = "contact steps [%]", "contact events", "trajectories with a contact [%]"
 RATE, SUCCESS, DISTANCE = "contact events per agent and minute", "success [%]", "goal distance [m]"
 MEASURED = (TOUCHING, EVENTS, EVER, RATE, SUCCESS, DISTANCE)
@@ -101,11 +104,12 @@ class Policies:
             return train(config, learning, self.place(IMITATED), validation=validation, progress=report)
 
     def improved(self, row: str) -> Model:
-        """The policy of a row of `FREEZE`, trained if need be. Raises Busy where another process does that."""
+        """The policy of a row of `TRAINED`, trained if need be. Raises Busy where another process does that."""
         world, minutes, place = WORLD.world(), self.effort.minutes, self.place(row)
         env = SwarmEnv(world.scene, spawn=world.spawn, horizon=STEPS, terminate_on_contact=True)
         task = SwarmTask(env, REWARD)
-        config = replace(PPO, seed=self.seed, freeze=FREEZE[row], iterations=rl_command.ENDLESS)
+        config = replace(PPO, seed=self.seed, freeze=TRAINED[row], iterations=rl_command.ENDLESS)
+        config = replace(config, terminations=TERMINATIONS.get(row, PPO.terminations))
         began = replace(self, data=FEW if row == SCRATCH else self.data).imitated()
 
         def report(done: int, total: int, found: dict) -> None:
@@ -133,9 +137,9 @@ class Policies:
         return load(path)
 
     def judged(self, row: str, world: SimulateConfig, folder: Path) -> dict[str, float]:
-        """`measured`; for a row of `FREEZE` also `compared` with the imitation policy, and one scene of both kept."""
+        """`measured`; for a row of `TRAINED` also `compared` with the imitation policy, and one scene of both kept."""
         acted = self.acted(row, world)
-        if row not in FREEZE:
+        if row not in TRAINED:
             return measured(acted)
         imitation = self.acted(IMITATED, world)
         one, other = (t.take([telling(imitation)]) for t in (acted, imitation))
@@ -225,18 +229,19 @@ def learned(policies: Policies, row: str) -> dict[str, float]:
 
 
 def run_5_2(cell: Cell, effort: Effort, folder: Path, progress: Update) -> dict[str, float]:
-    """Trains the row's policy and judges it on unseen scenes; nothing from 10k demonstrations in profile quick."""
-    if cell.data == MANY and effort.profile == "quick":
+    """Trains the row's policy and judges it on unseen scenes; in profile quick nothing from 10k demonstrations, and no
+    rows beside the modes."""
+    if effort.profile == "quick" and (cell.data == MANY or cell.row in TERMINATIONS):
         return {}
     policies = policies_of(cell, cell.data, effort, folder, progress)
     found = policies.judged(cell.row, replace(WORLD, scenes=TESTED * effort.test_scenes), folder)
-    found |= learned(policies, cell.row) if cell.row in FREEZE else {}
+    found |= learned(policies, cell.row) if cell.row in TRAINED else {}
     return _titled(cell.data, found, FIGURE_5_2)
 
 
 def draw_5_2(folder: Path, done: Sequence[tuple[Cell, dict]]) -> list[Path]:
     """Returns of all seeds over env-steps and over minutes, and contact events of all rows."""
-    done = [(cell, record) for cell, record in done if record["values"]]
+    done = [(cell, record) for cell, record in done if record["values"] and cell.row in ROWS]
     curves, events = {}, {}
     for cell, record in sorted(done, key=lambda pair: (pair[0].data != FEW, ROWS.index(pair[0].row), pair[0].seed)):
         name = cell.row if cell.data == FEW else f"{cell.row}, {cell.data}"
@@ -342,7 +347,7 @@ _JUDGED = (
 FIGURE_5_2 = Experiment(
     name="figure-5.2",
     about="PPO from scratch and from imitation (modes 0, 1, 2): return, contacts on unseen scenes, way from imitation",
-    rows=ROWS,
+    rows=(*ROWS, *TERMINATIONS),
     data_sets=tuple(
         _columns(
             data, *(column for name in MEASURED for column in interval(name)), EVENT_RATIO, GOAL_RATIO, AWAY, RETURN,
@@ -353,11 +358,12 @@ FIGURE_5_2 = Experiment(
     run=run_5_2,
     leading=(IMITATED, SCRATCH),
     untrained=(EXPERT,),
-    exists=lambda row, data: data == FEW or row not in (EXPERT, SCRATCH),
+    exists=lambda row, data: data == FEW or row not in (EXPERT, SCRATCH, *TERMINATIONS),
     unit="as named",
     notes=f"`1k`, `10k`: demonstrations of the imitation policy. {_JUDGED} Final return: last tenth of the iterations; "
     "where a mode first reaches that of `scratch` of the same seed, with the mean return of ten iterations: no number "
-    "where it does not. Profile quick goes without `10k`.",
+    "where it does not. Contacts end episodes in the first "
+    f"{PPO.terminations} iterations, in two rows always and never. Profile quick goes without `10k` and those rows.",
     figure=draw_5_2,
 )  # fmt: skip
 FIGURE_5_3 = Borrowing(
