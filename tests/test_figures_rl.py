@@ -281,6 +281,7 @@ def test_what_the_rows_are_trained_with(tmp_path, small, monkeypatch):
         return model
 
     monkeypatch.setattr(figures_5, "improve", improve)
+    monkeypatch.setattr(figures_5, "PPO", replace(figures_5.PPO, terminations=400))
     monkeypatch.setattr(figures_5.rl_command, "note", lambda row: "")
     model = random_model("thesis-ch5")
     monkeypatch.setattr(figures_5.Policies, "imitated", lambda self: replace(model, about={"from": self.data}))
