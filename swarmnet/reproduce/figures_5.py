@@ -253,6 +253,8 @@ def draw_5_2(folder: Path, done: Sequence[tuple[Cell, dict]]) -> list[Path]:
     seeds = sorted({cell.seed for cell, _ in trained})
     both = any(cell.data == MANY for cell, _ in trained)
     words = _words(trained[0][1], seeds, sizes=(FEW, MANY) if both else (FEW,)) if trained else ""
+    if trained and PPO.terminations:
+        words += f"; contacts end episodes in the first {PPO.terminations} iterations"
     if not done:
         return []
     return write(folder, "figure-5.2", return_history(curves, events, note=words))
