@@ -85,16 +85,20 @@ def test_ended_scenes_hand_out_their_last_observation_in_same_step_mode():
     env.reset(seed=0)
     other.reset(seed=0)
     actions = np.zeros((3, 3, 2), np.float32)
+
+    def same(one, other):  # two compiled programs need not round alike
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7)
+
     for t in range(4):
         seen, reward, _, truncated, infos = env.step(actions)
         plain = other.step(actions)
-        np.testing.assert_array_equal(reward, plain[1])
+        same(reward, plain[1])
         if t < 3:
             assert "final_obs" not in infos
     assert truncated.all()
     assert infos["_final_obs"].all()
-    np.testing.assert_array_equal(np.stack(infos["final_obs"]), plain[0])
-    np.testing.assert_array_equal(infos["final_info"]["agent_reward"], plain[4]["agent_reward"])
+    same(np.stack(infos["final_obs"]), plain[0])
+    same(infos["final_info"]["agent_reward"], plain[4]["agent_reward"])
     assert not infos["agent_reward"].any()
     assert infos["present"].all()
     fresh, _ = other.reset(options={"scenes": [3, 4, 5]})
