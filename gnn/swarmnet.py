@@ -136,7 +136,7 @@ class SwarmNet(nn.Module):
         )
         everyone = config.output == "state_change"  # then static nodes are predicted too, as published
         active = slice(first, first + graph.agent.shape[1])
-        receivers, present_state = nodes[:, active], last[:, active]
+        receivers, current = nodes[:, active], last[:, active]
 
         masks = {"goal": graph.goal, "obstacle": graph.obstacle, "agent": graph.agent}
         senders, places = (
@@ -144,18 +144,16 @@ class SwarmNet(nn.Module):
             for x in (nodes, last)
         )
         if config.nearest is not None and config.nearest < masks["agent"].shape[2]:
-            index, masks["agent"] = _nearest(
-                present_state[..., :2], last[:, first:, :2], masks["agent"], config.nearest
-            )
+            index, masks["agent"] = _nearest(current[..., :2], last[:, first:, :2], masks["agent"], config.nearest)
             for x in (senders, places):
                 x["agent"] = jnp.take_along_axis(x["agent"], index[..., None], axis=2)
         kinds = [name for name in EDGE_TYPES if senders[name].shape[2] and (config.context or name == "agent")]
-        ahead = heading(present_state[..., 2:]) if config.frame else None
+        ahead = heading(current[..., 2:]) if config.frame else None
         pairs = {name: self._pairs(receivers, senders[name], ahead) for name in kinds}
         messages = EdgeFunctions(config, name="edge")(pairs)
         typed = {"any": [(messages[name], masks[name]) for name in kinds]}
         if "near" in config.aggregate:
-            square = {name: _squared_distance(present_state, places[name]) for name in kinds}
+            square = {name: _squared_distance(current, places[name]) for name in kinds}
             near = Nearness(name="reach")(square)
             typed["near"] = [(messages[name] * near[name][..., None], masks[name]) for name in kinds]
         aggregate = jnp.concatenate(

@@ -178,7 +178,7 @@ def _about(config: PPOConfig, task: SwarmTask, model: Model, scratch: bool) -> d
     return {
         **{name: model.about[name] for name in ("preset", "train", "data", "range") if name in model.about},
         "initial": None if scratch else {"weights": fingerprint(model.params), **model.about},
-        "rl": plain(config) | {"checkpoint_seconds": None, "iterations": None, "chunk": None},
+        "rl": plain(config) | {"checkpoint_seconds": None, "iterations": None},
         "reward": plain(task.reward),
         "task": {
             "scene": plain(env.spec),

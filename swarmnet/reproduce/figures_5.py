@@ -65,6 +65,7 @@ ROWS = (EXPERT, IMITATED, *FREEZE)
 TERMINATIONS = {"mode 0, always to contact": None, "mode 0, always past contact": 0}
 """Rows beside mode 0 for whether contacts end episodes (`PPOConfig.terminations`)."""
 TRAINED = FREEZE | dict.fromkeys(TERMINATIONS, MODES[0])
+"""What stays as it is, for these rows too."""
 TOUCHING, EVENTS, EVER = "contact steps [%]", "contact events", "trajectories with a contact [%]"
 RATE, SUCCESS, DISTANCE = "contact events per agent and minute", "success [%]", "goal distance [m]"
 MEASURED = (TOUCHING, EVENTS, EVER, RATE, SUCCESS, DISTANCE)
@@ -108,8 +109,8 @@ class Policies:
         world, minutes, place = WORLD.world(), self.effort.minutes, self.place(row)
         env = SwarmEnv(world.scene, spawn=world.spawn, horizon=STEPS, terminate_on_contact=True)
         task = SwarmTask(env, REWARD)
-        config = replace(PPO, seed=self.seed, freeze=TRAINED[row], iterations=rl_command.ENDLESS)
-        config = replace(config, terminations=TERMINATIONS.get(row, PPO.terminations))
+        ends = TERMINATIONS.get(row, PPO.terminations)
+        config = replace(PPO, seed=self.seed, freeze=TRAINED[row], terminations=ends, iterations=rl_command.ENDLESS)
         began = replace(self, data=FEW if row == SCRATCH else self.data).imitated()
 
         def report(done: int, total: int, found: dict) -> None:
