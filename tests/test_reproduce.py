@@ -15,11 +15,14 @@ import swarmnet.reproduce.work
 from gnn.config import TrainConfig
 from swarm_mjcf.errors import SpecError, SwarmError
 from swarmnet.cli import main
+from swarmnet.reproduce import table_4_1
+from swarmnet.reproduce.borrow import Learning
 from swarmnet.reproduce.cells import read_record, records, run_cells
 from swarmnet.reproduce.experiment import PROFILES, REGISTRY, Cell, DataSet, Effort, Experiment, find
 from swarmnet.reproduce.lock import Busy, locked
 from swarmnet.reproduce.merge import merge, table
 from swarmnet.reproduce.table_3_1 import TABLE_3_1
+from swarmnet.reproduce.table_4_1 import TABLE_4_1
 from swarmnet.results import render_page, write_results
 
 EFFORT = Effort(profile="cpu", demonstrations=10, test_scenes=4, minutes=1.0, data=Path("unused"))
@@ -329,6 +332,35 @@ def test_the_thesis_s_figures_stand_where_they_belong():
     for name, some in figures.items():
         for (row, column), value in some.items():
             assert find(name).reference(row, column) == value
+
+
+def test_a_crowd_is_tested_with_the_network_of_the_same_row_and_seed(tmp_path: Path, monkeypatch):
+    """Sizes learned from and tested on by cell of table 4.1; nothing is trained."""
+    learned = []
+
+    def trained_once(learning: Learning, agents: int, *_) -> str:
+        learned.append((learning, agents))
+        return learning.model
+
+    fakes = {
+        "trained_once": trained_once,
+        "demonstrations": lambda world, effort, seed: world.num_agents,
+        "unseen": lambda world, effort: 1000.0 * world.num_agents + effort.test_scenes,
+        "errors": lambda model, unseen, horizons, names: {name: unseen for name in names},
+    }
+    for name, fake in fakes.items():
+        monkeypatch.setattr(table_4_1, name, fake)
+    effort = replace(TABLE_4_1.effort("cpu", tmp_path), test_scenes=500)
+    found = {}
+    for cell in TABLE_4_1.cells((2,), ("swarmnet best", "seq2seq"), ("boids", "boids crowd")):
+        found[cell.row, cell.data] = TABLE_4_1.run(cell, effort, tmp_path, lambda *_, **__: None)
+    assert found == {  # 1000 agents + scenes
+        ("swarmnet best", "boids"): {"boids N=5": 5500, "boids N=10": 10500, "boids N=20": 20125},
+        ("swarmnet best", "boids crowd"): {"boids N=200": 200_007},
+        ("seq2seq", "boids"): {"boids N=10": 10500},
+    }
+    best = (Learning(model="best", seed=2), 10)
+    assert learned == [best, best, (Learning(model="seq2seq", seed=2), 10)]
 
 
 def test_a_real_cell_trains_tests_and_goes_on_where_it_was(tmp_path: Path, monkeypatch):
