@@ -1,5 +1,6 @@
 """Settings that must stand before any test module imports JAX, and Hypothesis's profile."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -9,6 +10,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
 # Compiling is two thirds of the suite's time, and tests compile much and run little; 0 tests what users run, slowly.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+# Split up to be compiled by several threads, a program takes a tenth longer where every core has its own worker.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_parallel_codegen_split_count=1")
 
 from hypothesis import settings
 
@@ -18,3 +21,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 # The first example of a test compiles, so no single example has a deadline. CI tries the same examples each time.
 settings.register_profile("swarmnet", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("swarmnet")
+
+
+def pytest_collection_finish() -> None:
+    """What imports and collection made stays to the end: the garbage collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
