@@ -35,7 +35,7 @@ from repair.limits import executed
 from repair.linearise import FreeWeights, Linearised
 from repair.network import Situations, actions, check_encodable, concatenate, fitted
 from repair.once import by_branches, by_programs, mendable
-from repair.relax import Problem, Relaxation, relax
+from repair.relax import Relaxation, SequentialProblem, relax
 from repair.screen import Acted, Perform, Screened, decisions, screen
 from repair.verify import Verification, verify
 from swarm_mjcf.errors import SwarmError
@@ -90,9 +90,9 @@ class _Work:
 
     def problem(
         self, constraint: Constraint, constrained: Situations, anchors: Situations, targets: Float[Array, "A 2"]
-    ) -> Problem:
+    ) -> SequentialProblem:
         """A sequential program of this repair."""
-        return Problem(
+        return SequentialProblem(
             scales=self.model.scales,
             normalise=self.normalise,
             constraint=constraint,

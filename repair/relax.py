@@ -32,7 +32,7 @@ from repair.network import Situations, actions
 
 
 @dataclass(frozen=True, kw_only=True)
-class Problem:
+class SequentialProblem:
     """What is to be repaired: rows that must hold, rows whose actions should stay, and by what."""
 
     scales: Scales
@@ -96,7 +96,7 @@ class Relaxed:
 
 
 def relax(
-    problem: Problem,
+    problem: SequentialProblem,
     params: Params,
     free: FreeWeights,
     settings: Relaxation,
@@ -146,7 +146,9 @@ def relax(
     return Relaxed(params, Status.FEASIBLE if violated == 0 else Status.ELASTIC, violated, merit["merit"], history)
 
 
-def _merit(problem: Problem, params: Params, free: FreeWeights, home: Float[Array, " P"], settings: Relaxation) -> dict:
+def _merit(
+    problem: SequentialProblem, params: Params, free: FreeWeights, home: Float[Array, " P"], settings: Relaxation
+) -> dict:
     """The true objective, with what it is made of."""
     deviation = np.mean(np.sum((problem.act(params, problem.anchors) - problem.targets) ** 2, axis=1))
     missed = problem.shortfall(problem.act(params, problem.constrained))
@@ -158,7 +160,7 @@ def _merit(problem: Problem, params: Params, free: FreeWeights, home: Float[Arra
 
 
 def _linear_model(
-    problem: Problem,
+    problem: SequentialProblem,
     params: Params,
     free: FreeWeights,
     home: Float[Array, " P"],

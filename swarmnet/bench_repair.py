@@ -23,8 +23,7 @@ from repair.encounters import Bodies, encounters
 from repair.linearise import FreeWeights, Linearised
 from repair.network import Situations, actions, check_encodable
 from repair.problem import Problem
-from repair.relax import Problem as Sequence
-from repair.relax import Relaxation, relax
+from repair.relax import Relaxation, SequentialProblem, relax
 from repair.screen import decisions, screen
 from repair.solve import Limits, solve
 from repair.verify import verify
@@ -170,7 +169,7 @@ def edge_function(
     for count in rows:
         drawn = study.drawn(barrier, count, broken=True)
         targets = study.acts(drawn)
-        sequence = Sequence(
+        sequence = SequentialProblem(
             scales=model.scales, normalise=True, constraint=barrier, bodies=study.bodies, kinematics=model.integrator,
             constrained=drawn, anchors=drawn, targets=targets,
         )  # fmt: skip
@@ -252,7 +251,7 @@ def loop_parts(study: Study, *, steps: int = DescentConfig().steps) -> Iterator[
     linearised = Linearised(free, model.scales, normalise=True)
     broken = study.situations.take(np.flatnonzero(found.avoidable)[: how.hard])
     anchors = study.situations.take(rows[: how.anchors])
-    sequence = Sequence(
+    sequence = SequentialProblem(
         scales=model.scales, normalise=True, constraint=barrier, bodies=study.bodies, kinematics=model.integrator,
         constrained=broken, anchors=anchors, targets=study.acts(anchors),
     )  # fmt: skip

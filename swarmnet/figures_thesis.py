@@ -7,6 +7,7 @@ viridis without its lightest end, in order.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -27,6 +28,8 @@ from swarm_mjcf.errors import SpecError
 from swarmnet.sheets import STYLE, WIDTHS
 
 _GREY, _TRUTH, _FAINT = "#4a505a", "#8a9099", "#e4e7ec"
+_LETTER = 0.065
+"""Width of a title's letter [in]: longer titles are broken."""
 _BEYOND = 1.5
 """Predictions may widen a panel to this many times the size of the truth; what runs farther away leaves the panel."""
 
@@ -77,11 +80,14 @@ def prediction_sheet(panels: Sequence[Shown], *, columns: int, note: str = "", s
         raise SpecError("side", names, f"{lines} names, one for each line of panels")
     width = WIDTHS["page"]
     inches = (width - 0.3) / columns - 0.25
-    figure = _blank(width, lines * (inches + 0.32) + 0.3 + 0.17 * (note.count("\n") + 1 if note else 0))
+    titles = [fill(panel.title, max(8, round((inches + 0.25) / _LETTER)), break_on_hyphens=False) for panel in panels]
+    more = sum(max(title.count("\n") for title in titles[i : i + columns]) for i in range(0, len(titles), columns))
+    height = lines * (inches + 0.32) + 0.3 + 0.14 * more + 0.17 * (note.count("\n") + 1 if note else 0)
+    figure = _blank(width, height)
     grid = figure.subplots(lines, columns, squeeze=False)
     for number, (axes, panel) in enumerate(zip(grid.ravel(), panels, strict=False)):
         _draw(axes, panel, inches)
-        axes.set_title(panel.title)
+        axes.set_title(titles[number])
         ticks = max(2, min(5, round(inches / 0.45)))
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(MaxNLocator(ticks, steps=[1, 2, 5, 10]))

@@ -197,6 +197,17 @@ def test_agents_that_overflow_are_absent_and_their_error_is_infinite(still) -> N
     assert np.isinf(scene_errors(truth, guess, 1)).all()
 
 
+def test_long_titles_are_broken_and_keep_off_each_other() -> None:
+    figure = prediction_sheet([Shown(scene(), scene(), "swarmnet thesis-ch3 context, sample 1")] * 12, columns=6)
+    figure.draw_without_rendering()
+    boxes = [axes.title.get_window_extent() for axes in figure.axes]
+    assert not any(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])
+    assert all(figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1 for box in boxes)
+    panels = [axes.get_window_extent() for axes in figure.axes]
+    assert not any(box.overlaps(panel) for box in boxes for panel in panels)
+    assert panels[0].width > 0.1 * figure.bbox.width
+
+
 def test_scene_errors_by_hand() -> None:
     # The second agent is 2 m off in y in 3 of the 5 rows after the first: 3 * 4 over 3 * 5 + 3 nodes of 4 dimensions.
     np.testing.assert_allclose(scene_errors(scene(), scene(shift=2.0), 1), [3 * 4 / (18 * 4)])
@@ -300,7 +311,7 @@ def test_figure_3_6_draws_the_sizes_that_the_profile_allows(tmp_path) -> None:
     assert [path.name for path in FIGURE_3_6.figure(tmp_path, done)] == ["figure-3.6.png", "figure-3.6.pdf"]
     assert FIGURE_3_6.figure(tmp_path, done[2:]) == []  # nothing to compare with
     big = Cell("100K", "boids", 0)
-    assert FIGURE_3_6.run(big, effort(tmp_path), tmp_path / "a" / "b" / "c" / "d", lambda *_: None) == {}
+    assert FIGURE_3_6.run(big, effort(tmp_path), tmp_path / "a" / "b" / "c" / "d", lambda *_, **__: None) == {}
 
 
 def test_a_run_of_a_sibling_is_copied_and_only_the_same_one(tmp_path, short) -> None:

@@ -28,7 +28,7 @@ from repair.limits import executed
 from repair.linearise import FreeWeights, Linearised
 from repair.loop import repair
 from repair.network import Situations, actions, fitted
-from repair.relax import Problem, Relaxation, relax
+from repair.relax import Relaxation, SequentialProblem, relax
 from repair.screen import Acted, decisions, least, screen
 from repair.verify import clopper_pearson, verify
 from swarm_mjcf.errors import SpecError, SwarmError
@@ -64,12 +64,12 @@ def approaching(rows: int = 60, seed: int = 0) -> Situations:
     return Situations(own=own, senders=places, present=present)
 
 
-def problem(m: Model, constraint=None, rows: int = 60) -> Problem:
+def problem(m: Model, constraint=None, rows: int = 60) -> SequentialProblem:
     constraint = constraint or Barrier(kinematics=MOTION)
     situations = approaching(rows)
     judged = screen(constraint, situations, actions(m.params, m.scales, situations), BODIES, MOTION)
     anchors = approaching(80, 1)
-    return Problem(
+    return SequentialProblem(
         scales=m.scales, normalise=True, constraint=constraint, bodies=BODIES, kinematics=MOTION,
         constrained=situations.take(judged.possible & judged.apart), anchors=anchors,
         targets=np.asarray(actions(m.params, m.scales, anchors)),
