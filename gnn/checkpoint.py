@@ -95,7 +95,9 @@ class Checkpoints:
             # A checkpoint may come from other devices than there are here.
             here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
             args = ocp.args.Composite(state=ocp.args.StandardRestore(template, fallback_sharding=here))
-            return self._manager.restore(step, args=args)["state"]
+            state = self._manager.restore(step, args=args)["state"]
+        # Bound to no device, like the state of a run that begins: for arrays that are, JAX compiles everything anew.
+        return jax.tree.map(jnp.asarray, jax.device_get(state))
 
     def newest(self, like: dict | None = None) -> tuple[int, dict, dict] | None:
         """`(step, about, state)` of the newest checkpoint that can be read, None where there is none.

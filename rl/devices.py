@@ -195,8 +195,11 @@ def gathered(state: Any, mesh: Mesh | None) -> Any:
     return jax.device_get(state)
 
 
-def placed(state: Any, like: Any) -> Any:
-    """The inverse: arrays spread as those of `like` are."""
+def placed(state: Any, like: Any, mesh: Mesh | None) -> Any:
+    """The inverse: arrays spread as those of `like` are. On one device bound to none, like those of a run that begins:
+    for arrays that are, JAX compiles once more."""
+    if mesh is None:
+        return jax.tree.map(jnp.asarray, state)
 
     def place(x: Any, there: jax.Array) -> jax.Array:
         return jax.make_array_from_callback(there.shape, there.sharding, lambda part: np.asarray(x)[part])

@@ -133,7 +133,7 @@ def train(
             )
         checkpoints.drop_after(step)
         whole = gathered(state, mesh)
-        state = placed(_unpacked(checkpoints.restore(step, _packed(whole)), whole), state)
+        state = placed(_unpacked(checkpoints.restore(step, _packed(whole)), whole), state, mesh)
     done = int(state["iteration"])
     metrics, saved_at = Metrics(folder, after_step=done) if leads() else None, time.monotonic()
     spent = sum(row["seconds"] for row in read_metrics(folder / "metrics.jsonl"))

@@ -74,13 +74,13 @@ def test_the_mean_action_is_the_imitated_one_and_the_value_is_another_readout():
         params = jax.jit(actor.init)(jax.random.key(1), observation)
         apply = jax.jit(actor.apply)
         mean, value = apply(params, observation)
-        imitated = make_policy(model(preset).config, model(preset).scales)(state, model(preset).params)
+        imitated = jax.jit(make_policy(model(preset).config, model(preset).scales))(state, model(preset).params)
         np.testing.assert_allclose(mean, imitated, atol=1e-5)
         assert value.shape == mean.shape[:2]
         same(network_weights(params), model(preset).params)
         here = np.asarray(state.agent_present)
         assert not here.all()
-        for whole, each in zip((mean, value), apply(params, actor.views(observation)), strict=True):
+        for whole, each in zip((mean, value), apply(params, jax.jit(actor.views)(observation)), strict=True):
             np.testing.assert_allclose(each.reshape(whole.shape)[here], whole[here], atol=1e-5)
         np.testing.assert_allclose(params[STD], np.log(0.2 * task().env.spec.max_acceleration), rtol=1e-6)
         other = params | {VALUE: jax.tree.map(lambda x: x + 1, params[VALUE])}
@@ -96,8 +96,8 @@ def test_the_mean_action_is_the_imitated_one_and_the_value_is_another_readout():
 def test_contacts_end_episodes_in_the_first_iterations_alone():
     config = replace(CONFIG, steps=6, terminations=2)
     actor, here = swarm_actor_critic(model(), gamma=0.9, initial_std=0.2), task(terminate=True)
-    runner = start(here, config, jnp.arange(config.scenes))
-    params = actor.init(jax.random.key(1), here.observe(runner.world))
+    runner = jax.jit(lambda: start(here, config, jnp.arange(config.scenes)))()
+    params = jax.jit(lambda: actor.init(jax.random.key(1), here.observe(runner.world)))()
     found = jax.jit(lambda number: collect(here, actor, params, runner, config, number)[1])
     first, later = found(jnp.int32(1)), found(jnp.int32(2))
     touched = np.asarray(first.measures["contact_events"]).any(axis=2)
