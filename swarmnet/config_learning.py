@@ -327,6 +327,9 @@ class Reproduce:
     """Seeds of data and weights; the profile's by default."""
     minutes: float | None = None
     """Training of one cell [min], the same for every row; the profile's by default."""
+    jobs: int | None = None
+    """Processes that share the cells; 1 by default, but 2 in profile quick. More train less in the same minutes where
+    they have no cores of their own."""
     merge_only: bool = False
     """Run nothing: merge, print and draw what is there."""
     out: Path = Path("runs/reproduce")
@@ -339,3 +342,5 @@ class Reproduce:
             raise SpecError("minutes", self.minutes, "a finite number above 0 [min]")
         if any(seed < 0 for seed in self.seeds):
             raise SpecError("seeds", self.seeds, "at least 0 each")
+        if self.jobs is not None and self.jobs < 1:
+            raise SpecError("jobs", self.jobs, "at least 1")

@@ -259,7 +259,7 @@ def test_norms_of_messages_and_of_what_joins_them(preset, times) -> None:
 def short(monkeypatch):
     """Presets of few weights, and trainings of 2 steps, since the minutes allow no more."""
 
-    def config(model: str, seed: int) -> TrainConfig:
+    def config(model: str, seed: int, minutes: float) -> TrainConfig:
         return TrainConfig(model=model, seed=seed, horizons=(1,), stage_steps=(2,), chunk=2, batch=4)
 
     for module in (work, borrow):

@@ -14,7 +14,9 @@ from learning import environment, quick_training
 import swarmnet.reproduce.work
 from gnn.config import TrainConfig
 from swarm_mjcf.errors import SpecError, SwarmError
-from swarmnet.cli import main
+from swarmnet.cli import main, parse
+from swarmnet.commands import reproduce as command
+from swarmnet.config import Reproduce
 from swarmnet.reproduce import table_4_1
 from swarmnet.reproduce.borrow import Learning
 from swarmnet.reproduce.cells import read_record, records, run_cells
@@ -87,7 +89,7 @@ def test_rows_and_columns_or_data_sets_choose_cells(fake: Fake):
 
 
 def test_quick_shares_its_minutes_among_the_cells_that_train(fake: Fake, tmp_path: Path):
-    assert fake.experiment.effort("quick", tmp_path).minutes == 12 / 4
+    assert fake.experiment.effort("quick", tmp_path).minutes == 6 / 4
     assert fake.experiment.effort("cpu", tmp_path).minutes == PROFILES["cpu"].minutes == 5
     assert fake.experiment.effort("cpu", tmp_path, 7.5).minutes == 7.5
     with pytest.raises(SpecError, match=r"profile.*'slow'.*quick, cpu, full"):
@@ -106,7 +108,8 @@ def test_a_finished_cell_is_not_run_again_and_an_interrupted_one_is(fake: Fake, 
     assert outcome.done == tuple(cells)
     record = read_record(cells[0].path(tmp_path)) or {}
     assert record["values"] == {"one 5": 0.0, "one 40": 0.0}
-    assert {"demonstrations", "minutes", "steps", "wall_seconds", "dt", "hardware", "versions", "commit"} <= set(record)
+    assert "steps" not in record  # it trained nothing
+    assert {"demonstrations", "minutes", "wall_seconds", "dt", "hardware", "versions", "commit"} <= set(record)
     assert "minutes" not in (read_record(cells[-1].path(tmp_path)) or {})  # it learned nothing
 
 
@@ -334,6 +337,46 @@ def test_the_thesis_s_figures_stand_where_they_belong():
             assert find(name).reference(row, column) == value
 
 
+def test_jobs_share_the_cells_and_end_with_the_command(fake: Fake, tmp_path: Path, monkeypatch, capsys):
+    """A helper is the same command with one job; what it was at is not done twice, what it left is done in the end."""
+    started = []
+
+    class Helper:
+        def __init__(self, command: list[str], **_):
+            self.said, self.lock = (
+                [],
+                locked(fake.experiment.cells((0,))[0].path(tmp_path / "quick/fake") / "cell.lock"),
+            )
+            self.lock.__enter__()
+            started.append((command, self))
+
+        def wait(self):
+            if not self.said:
+                self.lock.__exit__(None, None, None)  # it dies at its first cell
+            self.said.append("waited for")
+
+        def terminate(self):
+            self.said.append("terminated")
+
+    monkeypatch.setattr(command, "subprocess", types.SimpleNamespace(Popen=Helper, DEVNULL=None))
+    monkeypatch.setattr(command, "find", lambda name: fake.experiment)
+    config = Reproduce(name="fake", out=tmp_path, jobs=2)
+    assert command.run(config) == 0
+    ((words, helper),) = started
+    assert parse(words[3:]) == replace(config, jobs=1)
+    assert helper.said == ["waited for", "terminated", "waited for"]
+    assert len(fake.calls) == len(set(fake.calls)) == len(fake.experiment.cells((0,)))
+    assert fake.calls[-1] == fake.experiment.cells((0,))[0]
+    whole = Reproduce(
+        name="table-3.1", profile="cpu", rows=("swarmnet best", "kipf"), columns=("boids dt0.1",), seeds=(0, 2),
+        minutes=0.5, out=tmp_path, json=tmp_path / "t.json",
+    )  # fmt: skip
+    assert parse(command.arguments(whole)) == whole
+    started.clear()
+    command.run(Reproduce(name="fake", profile="cpu", out=tmp_path))
+    assert not started  # minutes that are to be compared are not shared
+
+
 def test_a_crowd_is_tested_with_the_network_of_the_same_row_and_seed(tmp_path: Path, monkeypatch):
     """Sizes learned from and tested on by cell of table 4.1; nothing is trained."""
     learned = []
@@ -364,7 +407,7 @@ def test_a_crowd_is_tested_with_the_network_of_the_same_row_and_seed(tmp_path: P
 
 
 def test_a_real_cell_trains_tests_and_goes_on_where_it_was(tmp_path: Path, monkeypatch):
-    def short(model: str, seed: int) -> TrainConfig:
+    def short(model: str, seed: int, minutes: float) -> TrainConfig:
         return TrainConfig(model=model, seed=seed, horizons=(1, 2), stage_steps=(4, 2), chunk=2, batch=4)
 
     monkeypatch.setattr(swarmnet.reproduce.work, "curriculum", short)

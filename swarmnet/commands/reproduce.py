@@ -1,6 +1,10 @@
 """`swarmnet reproduce`."""
 
+import contextlib
+import os
+import subprocess
 import sys
+from collections.abc import Iterator
 
 from swarmnet.config import Reproduce
 from swarmnet.reproduce.cells import claimed, records, run_cells
@@ -35,7 +39,12 @@ def run(config: Reproduce) -> int:
         merged()
 
     if not config.merge_only:
-        outcome = run_cells(experiment, cells, effort, folder, finished=finished)
+        with helpers(config) as running:
+            outcome = run_cells(experiment, cells, effort, folder, finished=finished)
+            for helper in running:
+                helper.wait()
+        if running:  # done by now, or left by one that died
+            outcome = run_cells(experiment, outcome.busy, effort, folder, finished=finished)
         for cell in outcome.busy:
             print(f"skipped, another process works on it: {cell}", file=sys.stderr)
     results = merged()
@@ -46,6 +55,32 @@ def run(config: Reproduce) -> int:
         for path in experiment.figure(folder, done):
             print(path)
     return 1 if results.more["failed"] else 0
+
+
+@contextlib.contextmanager
+def helpers(config: Reproduce) -> Iterator[list[subprocess.Popen]]:
+    """The other jobs, which do the same without a word; ended with the block."""
+    jobs = config.jobs or (min(2, os.cpu_count() or 1) if config.profile == "quick" else 1)
+    command = [sys.executable, "-m", "swarmnet", *arguments(config), "--jobs", "1"]
+    silent = subprocess.DEVNULL
+    running = [subprocess.Popen(command, stdout=silent, stderr=silent) for _ in range(jobs - 1)]
+    try:
+        yield running
+    finally:
+        for helper in running:
+            helper.terminate()
+            helper.wait()
+
+
+def arguments(config: Reproduce) -> list[str]:
+    """The words that give this configuration, without the number of jobs."""
+    words = ["reproduce", str(config.name), "--profile", config.profile, "--out", str(config.out)]
+    lists = {"--rows": config.rows, "--columns": config.columns, "--seeds": config.seeds}
+    for option, values in lists.items():
+        words += [option, *map(str, values)] if values else []
+    for option, value in {"--minutes": config.minutes, "--json": config.json}.items():
+        words += [] if value is None else [option, str(value)]
+    return words
 
 
 def _command(config: Reproduce, experiment: Experiment, minutes: float | None) -> str:

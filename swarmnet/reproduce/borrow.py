@@ -52,7 +52,7 @@ def trained_once(wanted: Learning, data: Trajectories, effort: Effort, place: Pa
 def _same(path: Path, wanted: Learning, data: Trajectories, effort: Effort) -> bool:
     """Whether the run with this plan is finished, and the one that is wanted."""
     plan = json.loads(path.read_text())
-    given = plain(curriculum(wanted.model, wanted.seed)) | {"checkpoint_seconds": None}
+    given = plain(curriculum(wanted.model, wanted.seed, effort.minutes)) | {"checkpoint_seconds": None}
     if (plan["minutes"], plan["given"]) != (effort.minutes, given):
         return False
     try:

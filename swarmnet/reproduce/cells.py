@@ -91,8 +91,9 @@ def run_cell(experiment: Experiment, cell: Cell, effort: Effort, place: Path, up
     except Exception as error:  # a night of cells must not end with the first that breaks
         write_whole(place / "error.txt", traceback.format_exc())
         record["failed"] = f"{type(error).__name__}: {error}".splitlines()[0] + f" (see {place / 'error.txt'})"
-    if cell.row not in experiment.untrained:
-        record |= dict(zip(("steps", "training_seconds"), spent(place), strict=True))
+    steps, seconds = spent(place)
+    if steps:  # nothing is said of networks that were trained outside the cell, which figures 5.2 to 5.4 share
+        record |= {"steps": steps, "training_seconds": seconds}
     return record | {
         "wall_seconds": before + time.monotonic() - begun,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

@@ -87,10 +87,10 @@ class Profile:
     """Training per cell [min]; None: `QUICK_MINUTES` shared by all cells that train."""
 
 
-QUICK_MINUTES = 12.0
+QUICK_MINUTES = 6.0
 """Training of a whole experiment in profile quick [min]."""
 PROFILES = {
-    "quick": Profile(seeds=(0,), demonstrations=1000, test_scenes=200, minutes=None),
+    "quick": Profile(seeds=(0,), demonstrations=1000, test_scenes=100, minutes=None),
     "cpu": Profile(seeds=(0, 1, 2), demonstrations=5000, test_scenes=500, minutes=5.0),
     "full": Profile(seeds=(0, 1, 2), demonstrations=50_000, test_scenes=500, minutes=60.0),
 }

@@ -59,7 +59,7 @@ def _row(experiment: Experiment, row: str, column: str, cells: list[dict]) -> Ro
             "dt": cells[0]["dt"],
             "demonstrations": _only(record.get("demonstrations") for record in cells),
             "minutes": _only(record.get("minutes") for record in cells),
-            "steps": [record["steps"] for record in cells if "steps" in record],
+            "steps": [record["steps"] for record in cells if record.get("steps")],
             "wall_seconds": round(statistics.fmean(record["wall_seconds"] for record in cells), 1),
             **({} if whole else {"diverged": len(values) - len(sound)}),
         },

@@ -25,6 +25,8 @@ VALIDATION = 0.05
 """Share of the demonstrations kept out of training."""
 TEST_SEED = 1_000_000
 """Seed of the unseen scenes; those of training are seeds of cells."""
+BRIEF = 10
+"""Gradient steps of a chunk in trainings of less than a minute."""
 PLAN = "plan.json"
 """What `train_for` keeps in the folder of a training."""
 
@@ -82,7 +84,7 @@ def trained(
     learning, validation = (mix(side) for side in zip(*(split(part, VALIDATION) for part in parts), strict=True))
     return train_for(
         effort.minutes,
-        curriculum(model, seed),
+        curriculum(model, seed, effort.minutes),
         learning,
         folder,
         validation=validation,
@@ -92,15 +94,17 @@ def trained(
     )
 
 
-def curriculum(model: str, seed: int) -> TrainConfig:
+def curriculum(model: str, seed: int, minutes: float) -> TrainConfig:
     """How a model is trained. Those of chapter 3 and the rivals as the thesis does it, to 10 steps, and with its batch.
 
     One that predicts an acceleration from one state learns a law without noise from single steps: on Boids, in equal
-    minutes, its error was half that of the curriculum, whose long predictions cost ten times as much per step.
+    minutes, its error was half that of the curriculum, whose long predictions cost ten times as much per step. In less
+    than a minute chunks are short: every stage takes three at least, which of Kipf's network are minutes otherwise.
     """
+    chunk = BRIEF if minutes < 1 else TrainConfig.chunk
     if model_preset(model).acts:
-        return TrainConfig(model=model, seed=seed, horizons=(1,), stage_steps=(10_000,), batch=64)
-    return TrainConfig(model=model, seed=seed)
+        return TrainConfig(model=model, seed=seed, horizons=(1,), stage_steps=(10_000,), batch=64, chunk=chunk)
+    return TrainConfig(model=model, seed=seed, chunk=chunk)
 
 
 def spent(folder: Path) -> tuple[int, float]:
