@@ -339,14 +339,12 @@ def test_the_thesis_s_figures_stand_where_they_belong():
 
 def test_jobs_share_the_cells_and_end_with_the_command(fake: Fake, tmp_path: Path, monkeypatch, capsys):
     """A helper is the same command with one job; what it was at is not done twice, what it left is done in the end."""
-    started = []
+    started, first = [], fake.experiment.cells((0,))[0]
 
     class Helper:
         def __init__(self, command: list[str], **_):
-            self.said, self.lock = (
-                [],
-                locked(fake.experiment.cells((0,))[0].path(tmp_path / "quick/fake") / "cell.lock"),
-            )
+            self.said: list[str] = []
+            self.lock = locked(first.path(tmp_path / "quick" / "fake") / "cell.lock")
             self.lock.__enter__()
             started.append((command, self))
 
@@ -366,7 +364,7 @@ def test_jobs_share_the_cells_and_end_with_the_command(fake: Fake, tmp_path: Pat
     assert parse(words[3:]) == replace(config, jobs=1)
     assert helper.said == ["waited for", "terminated", "waited for"]
     assert len(fake.calls) == len(set(fake.calls)) == len(fake.experiment.cells((0,)))
-    assert fake.calls[-1] == fake.experiment.cells((0,))[0]
+    assert fake.calls[-1] == first
     whole = Reproduce(
         name="table-3.1", profile="cpu", rows=("swarmnet best", "kipf"), columns=("boids dt0.1",), seeds=(0, 2),
         minutes=0.5, out=tmp_path, json=tmp_path / "t.json",
