@@ -1,9 +1,11 @@
 """Experiments in cells: what is done once, what is merged, what is missing, and who works on what."""
 
 import json
+import os
 import subprocess
 import sys
 import textwrap
+import time
 import types
 from dataclasses import replace
 from pathlib import Path
@@ -356,7 +358,7 @@ def test_jobs_share_the_cells_and_end_with_the_command(fake: Fake, tmp_path: Pat
         def terminate(self):
             self.said.append("terminated")
 
-    monkeypatch.setattr(command, "subprocess", types.SimpleNamespace(Popen=Helper, DEVNULL=None))
+    monkeypatch.setattr(command, "subprocess", types.SimpleNamespace(Popen=Helper, DEVNULL=None, PIPE=None))
     monkeypatch.setattr(command, "find", lambda name: fake.experiment)
     config = Reproduce(name="fake", out=tmp_path, jobs=2)
     assert command.run(config) == 0
@@ -373,6 +375,38 @@ def test_jobs_share_the_cells_and_end_with_the_command(fake: Fake, tmp_path: Pat
     started.clear()
     command.run(Reproduce(name="fake", profile="cpu", out=tmp_path))
     assert not started  # minutes that are to be compared are not shared
+
+
+def test_a_helper_ends_with_a_command_that_is_killed(tmp_path: Path):
+    helper = "import os, time; from swarmnet.reproduce.helper import end_with_parent; end_with_parent(); time.sleep(60)"
+    parent = (
+        "import subprocess, sys, time\n"
+        "found = subprocess.Popen([sys.executable, '-c', sys.argv[1]], stdin=subprocess.PIPE)\n"
+        "print(found.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    words = [sys.executable, "-c", parent, helper]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment()) as running:
+        assert running.stdout is not None
+        number = int(running.stdout.readline())
+        os.kill(number, 0)  # there
+        running.kill()
+        running.wait()
+        assert ended(number, seconds=30)
+
+
+def ended(process: int, *, seconds: float) -> bool:
+    """Whether a process that is nobody's child here ends in time."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return True
+        if Path(f"/proc/{process}/stat").exists() and " Z " in Path(f"/proc/{process}/stat").read_text():
+            return True  # ended; whoever has adopted it does not look after it
+        time.sleep(0.05)
+    return False
 
 
 def test_a_crowd_is_tested_with_the_network_of_the_same_row_and_seed(tmp_path: Path, monkeypatch):

@@ -59,11 +59,11 @@ def run(config: Reproduce) -> int:
 
 @contextlib.contextmanager
 def helpers(config: Reproduce) -> Iterator[list[subprocess.Popen]]:
-    """The other jobs, which do the same without a word; ended with the block."""
+    """The other jobs, which do the same without a word; they end with the block, and when this process is killed."""
     jobs = config.jobs or (min(2, os.cpu_count() or 1) if config.profile == "quick" else 1)
-    command = [sys.executable, "-m", "swarmnet", *arguments(config), "--jobs", "1"]
-    silent = subprocess.DEVNULL
-    running = [subprocess.Popen(command, stdout=silent, stderr=silent) for _ in range(jobs - 1)]
+    command = [sys.executable, "-m", "swarmnet.reproduce.helper", *arguments(config), "--jobs", "1"]
+    silent, held = subprocess.DEVNULL, subprocess.PIPE
+    running = [subprocess.Popen(command, stdin=held, stdout=silent, stderr=silent) for _ in range(jobs - 1)]
     try:
         yield running
     finally:
