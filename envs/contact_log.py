@@ -1,8 +1,9 @@
 """The contact log: one row for each episode of contact of a pair, in memory and as CSV or Parquet."""
 
-import os
+import contextlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +13,7 @@ from jaxtyping import Float, Int
 
 from envs.touching import PARTNERS, Touches
 from swarm_mjcf.errors import SwarmError
+from swarm_mjcf.whole import WholeFile
 
 
 class ContactLogError(SwarmError):
@@ -102,13 +104,12 @@ class ContactLogWriter:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._check_ending(self.path)
-        self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}.partial")
+        kind = arrow_csv.CSVWriter if self.path.suffix == ".csv" else arrow_parquet.ParquetWriter
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            if self.path.suffix == ".csv":
-                self._file = arrow_csv.CSVWriter(self._partial, SCHEMA)
-            else:
-                self._file = arrow_parquet.ParquetWriter(self._partial, SCHEMA)
+            with contextlib.ExitStack() as stack:
+                part = stack.enter_context(WholeFile(self.path))
+                self._file = stack.enter_context(kind(part, SCHEMA))
+                self._open = stack.pop_all()
         except OSError as error:
             raise ContactLogError(f"{self.path}: cannot be written ({error.strerror or error})") from error
 
@@ -125,15 +126,11 @@ class ContactLogWriter:
         columns = [pa.array(getattr(log, name), SCHEMA.field(name).type, from_pandas=True) for name in COLUMNS]
         self._file.write_batch(pa.record_batch(columns, schema=SCHEMA))
 
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
+    def __exit__(self, *error: Any) -> None:
         try:
-            self._file.close()
-            if kind is None:
-                os.replace(self._partial, self.path)
+            self._open.__exit__(*error)
         except OSError as failure:
             raise ContactLogError(f"{self.path}: cannot be written ({failure.strerror or failure})") from failure
-        finally:
-            self._partial.unlink(missing_ok=True)
 
 
 def save_log(path: str | Path, log: ContactLog) -> None:

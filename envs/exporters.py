@@ -21,6 +21,7 @@ from envs.importers.config import KINDS
 from envs.importers.parquet_file import UNITS_KEY
 from envs.trajectories import AGENT, GOAL, NO_EDGE, OBSTACLE, Trajectories
 from swarm_mjcf.errors import SpecError, SwarmError
+from swarm_mjcf.whole import WholeFile
 
 FORMATS = ("csv", "parquet", "published", "nri", "gns")
 UNITS = {"t": "s", "x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}
@@ -74,6 +75,8 @@ def export(
     if format == "nri":
         arrays = nri_arrays(whole)
         return _write({out / f"{name}_{split}{suffix}.npy": _npy(array) for name, array in arrays.items()})
+    if whole.position.shape[1] < 3:
+        raise ExportError(f"gns: accelerations need 3 rows of a scene, there are {whole.position.shape[1]}")
     simulations = gns_simulations(whole)
     about = gns_metadata(whole, connectivity_radius)
     return _write(
@@ -229,20 +232,13 @@ def _npz(file: io.BufferedWriter, simulations: Sequence[tuple[np.ndarray, np.nda
 
 def _write(files: dict[Path, Callable[[io.BufferedWriter], object]]) -> list[Path]:
     """Writes all files under other names and renames them when the last is done."""
-    partial = {path: path.with_name(f".{path.name}.{os.getpid()}.partial") for path in files}
     try:
-        for path, write in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with partial[path].open("wb") as file:
-                write(file)
-                file.flush()
-                os.fsync(file.fileno())
-        for path in files:
-            os.replace(partial[path], path)
+        with contextlib.ExitStack() as stack:
+            for path, write in files.items():
+                with stack.enter_context(WholeFile(path)).open("wb") as file:
+                    write(file)
+                    file.flush()
+                    os.fsync(file.fileno())
     except OSError as error:
         raise ExportError(f"{next(iter(files))}: cannot be written ({error.strerror or error})") from error
-    finally:
-        for left in partial.values():
-            with contextlib.suppress(OSError):
-                left.unlink(missing_ok=True)
     return list(files)

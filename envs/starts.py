@@ -207,3 +207,9 @@ def check_family(spec: SceneSpec, config: SpawnConfig) -> None:
         fitting = 1 + math.floor((high - low) / corridor_pitch(spec)) if high >= low else 0
         if spec.num_obstacles > fitting:
             raise SpecError("num_obstacles", spec.num_obstacles, f"at most {fitting} in a corridor of this arena")
+        # The corridor may lie in any direction and up to a quarter of its width aside: its farthest obstacle stays in.
+        along = abs(low + high) / 2 + max(spec.num_obstacles - 1, 0) / 2 * corridor_pitch(spec)
+        aside = math.sqrt(max((spec.arena - spec.obstacle_radius) ** 2 - along**2, 0.0)) - spec.obstacle_radius
+        if spec.num_obstacles and config.corridor_width > aside / 0.75:
+            allowed = f"at most {aside / 0.75:.1f} m with {spec.num_obstacles} obstacles in an arena of {spec.arena} m"
+            raise SpecError("corridor_width", config.corridor_width, allowed)

@@ -5,7 +5,6 @@ Stages keep the proportions of the given curriculum in gradient steps, and with 
 
 import json
 import math
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from gnn.checkpoint import CheckpointError, Model
 from gnn.config import TrainConfig
 from gnn.train import Prepared, Progress, prepare, train_prepared
 from swarm_mjcf.errors import SpecError
+from swarm_mjcf.whole import WholeFile
 
 CHUNKS = 3
 """Chunks of each stage that are measured at most; their median counts."""
@@ -112,7 +112,5 @@ def _read(path: Path, asked: dict) -> tuple[int, ...]:
 
 
 def _write(path: Path, plan: dict) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(plan, indent=1) + "\n")
-    os.replace(partial, path)
+    with WholeFile(path) as part:
+        part.write_text(json.dumps(plan, indent=1) + "\n")

@@ -1,10 +1,11 @@
 """Training metrics as JSON lines and for TensorBoard; on resume, rows after the checkpoint are dropped."""
 
 import json
-import os
 from pathlib import Path
 
 from tensorboardX import SummaryWriter
+
+from swarm_mjcf.whole import WholeFile
 
 
 class Metrics:
@@ -12,11 +13,9 @@ class Metrics:
 
     def __init__(self, folder: str | Path, *, after_step: int) -> None:
         self.path = Path(folder) / "metrics.jsonl"
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         kept = [row for row in read_metrics(self.path) if row["step"] <= after_step]
-        partial = self.path.with_suffix(".partial")
-        partial.write_text("".join(json.dumps(row) + "\n" for row in kept))
-        os.replace(partial, self.path)
+        with WholeFile(self.path) as part:
+            part.write_text("".join(json.dumps(row) + "\n" for row in kept))
         self._file = self.path.open("a")
         self._board = SummaryWriter(str(self.path.parent / "tensorboard"), purge_step=after_step + 1)
 

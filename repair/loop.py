@@ -6,7 +6,6 @@ there is no such theorem for loops of this kind.
 """
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +38,7 @@ from repair.relax import Relaxation, SequentialProblem, relax
 from repair.screen import Acted, Perform, Screened, decisions, screen
 from repair.verify import Verification, verify
 from swarm_mjcf.errors import SwarmError
+from swarm_mjcf.whole import WholeFile
 
 Progress = Callable[[int, int, dict], None]
 """`(done, total, what is known)`; total is the number of rounds."""
@@ -145,11 +145,8 @@ class _Work:
             for kind, tree in (("params", params), ("lessons", lessons), ("hard", hard))
             for i, leaf in enumerate(jax.tree.leaves(tree))
         } | {"row": np.array(json.dumps(self.history[-1]))}
-        self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"round-{number:02d}.npz"
-        with open(path.with_suffix(".part"), "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        os.replace(path.with_suffix(".part"), path)
+        with WholeFile(self.folder / f"round-{number:02d}.npz") as part:
+            np.savez(part, allow_pickle=False, **arrays)
 
     def load(self, number: int) -> Params | None:
         """Takes up what round `number` left; None where there is nothing whole."""

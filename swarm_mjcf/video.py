@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from swarm_mjcf.errors import SpecError, SwarmError
+from swarm_mjcf.whole import WholeFile
 
 log = logging.getLogger("swarm_mjcf")
 
@@ -121,27 +122,16 @@ def _even(frame: np.ndarray, target: Path, shape: tuple[int, ...]) -> np.ndarray
     return np.pad(frame, ((0, odd[0]), (0, odd[1]), (0, 0)), mode="edge") if any(odd) else frame
 
 
-class Unfinished:
-    """A path beside the target to write to: renamed on success, deleted otherwise."""
-
-    def __init__(self, target: Path) -> None:
-        self._target = target
-        self._part = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
+class Unfinished(WholeFile):
+    """A `WholeFile` whose errors are one line each."""
 
     def __enter__(self) -> Path:
-        with refused(self._target):
-            self._target.parent.mkdir(parents=True, exist_ok=True)
-            self._part.touch()
-        return self._part
+        with refused(self.path):
+            return super().__enter__()
 
-    def __exit__(self, kind: object, *_: object) -> None:
-        try:
-            if kind is None:
-                with refused(self._target):
-                    self._part.replace(self._target)
-        finally:
-            with suppress(OSError):
-                self._part.unlink(missing_ok=True)
+    def __exit__(self, kind: object, *others: object) -> None:
+        with refused(self.path):
+            super().__exit__(kind, *others)
 
 
 class refused:

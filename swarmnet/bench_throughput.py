@@ -31,6 +31,8 @@ class Throughput:
     compile_seconds: float
     contact_states: int
     """Agent-states in contact during the timed run: shows that bodies do collide."""
+    saturated: int
+    """Scene-states at which an engine's room for contacts was full, so that some may be missing."""
     peak_memory: int | None
     """Most device memory in use so far [bytes]; None where the device does not tell (CPUs)."""
 
@@ -66,20 +68,21 @@ def _measure(env: SwarmEnv, scenes: int, episodes: int, seed: int) -> Throughput
             )
             transition = env.step(state, action)
             contacts = transition.contacts
-            return (transition.state, total + (contacts.agent_states + contacts.obstacle_states).sum()), None
+            now = jnp.stack([(contacts.agent_states + contacts.obstacle_states).sum(), contacts.saturated.sum()])
+            return (transition.state, total + now), None
 
         (_, total), _ = jax.lax.scan(step, (state, total), jnp.arange(EPISODE))
         return total, None
 
     def run(first):
-        return jax.lax.scan(episode, jnp.zeros((), jnp.int32), first + jnp.arange(episodes))[0]
+        return jax.lax.scan(episode, jnp.zeros(2, jnp.int32), first + jnp.arange(episodes))[0]
 
     begun = time.perf_counter()
     compiled = jax.jit(run).lower(jnp.int32(0)).compile()
     compile_seconds = time.perf_counter() - begun
     jax.block_until_ready(compiled(jnp.int32(0)))
     begun = time.perf_counter()
-    touched = jax.block_until_ready(compiled(jnp.int32(episodes)))
+    touched, saturated = jax.block_until_ready(compiled(jnp.int32(episodes)))
     seconds = time.perf_counter() - begun
     memory = jax.devices()[0].memory_stats()
     return Throughput(
@@ -89,5 +92,6 @@ def _measure(env: SwarmEnv, scenes: int, episodes: int, seed: int) -> Throughput
         control_steps_per_second=scenes * EPISODE * episodes / seconds,
         compile_seconds=compile_seconds,
         contact_states=int(touched),
+        saturated=int(saturated),
         peak_memory=memory.get("peak_bytes_in_use") if memory else None,
     )

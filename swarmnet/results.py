@@ -12,6 +12,7 @@ from pathlib import Path
 
 from envs.trajectories import versions
 from swarm_mjcf.errors import SwarmError
+from swarm_mjcf.whole import WholeFile
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,10 @@ def _command(arguments: list[str]) -> str:
 
 def write_whole(path: Path, content: str | bytes) -> None:
     """Writes a file under a temporary name and renames it. Raises SwarmError with the reason."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(partial, path)
+        with WholeFile(path) as part:
+            part.write_bytes(content.encode() if isinstance(content, str) else content)
     except OSError as error:
-        partial.unlink(missing_ok=True) if partial.parent.is_dir() else None
         raise SwarmError(f"{path}: cannot be written ({error.strerror})") from error
 
 

@@ -3,7 +3,6 @@
 `python -m swarmnet.videos RUN FOLDER` writes the pictures of the README from a run.
 """
 
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +16,7 @@ from PIL import Image
 from envs.trajectories import Trajectories
 from swarm_mjcf.errors import SwarmError
 from swarm_mjcf.video import write_video
+from swarm_mjcf.whole import WholeFile
 from swarmnet.figures import STYLE, load_pair, paths_over_paths, telling_scenes
 from swarmnet.film import Film, Look, Panel, film, timing
 from swarmnet.selection import select
@@ -150,10 +150,8 @@ def _with_still(pictures: Iterator[np.ndarray], number: int, video: Path) -> Ite
     """Passes pictures on and saves one of them as NAME.jpg beside the video."""
     for index, picture in enumerate(pictures):
         if index == number:
-            video.parent.mkdir(parents=True, exist_ok=True)
-            partial = video.with_name(f".{video.stem}.{os.getpid()}.partial")
-            Image.fromarray(picture).save(partial, format="JPEG", quality=82)
-            os.replace(partial, video.with_suffix(".jpg"))
+            with WholeFile(video.with_suffix(".jpg")) as part:
+                Image.fromarray(picture).save(part, format="JPEG", quality=82)
         yield picture
 
 

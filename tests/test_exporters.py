@@ -213,6 +213,8 @@ def test_options_that_do_not_exist_and_places_that_cannot_be_written(tmp_path: P
     for options in ({"format": "json"}, {"partial": "keep"}, {"split": "all"}, {"connectivity_radius": 0.0}):
         with pytest.raises(SpecError):
             export(t, tmp_path / "x", **({"format": "gns"} | options))
+    with pytest.raises(ExportError, match="3 rows of a scene, there are 2"):
+        export(swarm(rows=2), tmp_path, "gns", partial="drop")
     (tmp_path / "file").write_text("")
     with pytest.raises(ExportError, match="cannot be written"):
         export(t, tmp_path / "file" / "t.csv", "csv")

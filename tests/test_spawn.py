@@ -348,6 +348,10 @@ def test_families_that_do_not_fit_are_refused_before_anything_is_drawn():
     check(replace(clear().scene, num_obstacles=10), family="corridor")
     with pytest.raises(SpecError, match="at most 10 in a corridor"):
         check(replace(clear().scene, num_obstacles=11), family="corridor")
+    # One obstacle lies 16.5 m along, up to 0.75 w + 7 m aside, and 93 m from the middle at most: w = 84.5 / 0.75.
+    check(family="corridor", corridor_width=112.0)
+    with pytest.raises(SpecError, match=r"corridor_width: 113\.0 was given, allowed is at most 112\.7 m with 1 obst"):
+        check(family="corridor", corridor_width=113.0)
     # Half of 90 agents start in a square of 40 m: 45 discs of 3 m fill 80% of it.
     crowd = replace(clear().scene, num_agents=90)
     with pytest.raises(

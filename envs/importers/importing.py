@@ -3,7 +3,6 @@
 import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from envs.importers.tracks import ImportFailed, Update, readable
 from envs.plain import plain
 from envs.storage import Header, TrajectoryWriter, read_header
 from envs.trajectories import TrajectoryError, versions
+from swarm_mjcf.whole import WholeFile
 
 BLUR = 0.1
 """Single precision must tell positions apart by this share of a median step at least."""
@@ -160,10 +160,8 @@ def _check_precision(figures: Survey, dt: float) -> None:
 
 
 def _write_text(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
+        with WholeFile(path) as part:
+            part.write_text(text, encoding="utf-8")
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise TrajectoryError(f"{path}: cannot be written ({error.strerror})") from error

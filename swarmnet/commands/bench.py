@@ -104,6 +104,7 @@ def _throughput(config: Bench) -> Results:
             ("physics steps/s", cell.control_steps_per_second * cell.substeps, "1/s"),
             ("compile", cell.compile_seconds, "s"),
             ("agent-states in contact", cell.contact_states, "1"),
+            ("scene-states saturated", cell.saturated, "1"),
             ("peak memory", cell.peak_memory, "bytes"),
         )
         for figure, value, unit in figures:
