@@ -104,7 +104,7 @@ def return_history(
     """Figure 5.2: smoothed returns over env-steps and over wall time, and contact events of a trajectory as bars.
 
     Lines are means over seeds, bands and whiskers go from the least to the greatest. What stands behind a comma in a
-    name (`mode 0, 10k`) is drawn dashed or hatched, in the colour of the name before it.
+    name (`mode 0, 10k`) gives line and hatch, in the colour of the name before it.
 
     Args:
       curves: histories of all seeds by name.
@@ -117,8 +117,9 @@ def return_history(
         raise SpecError("curves", dict(curves), "histories or contact events of at least one policy")
     figure = blank_figure(WIDTHS["page"], 2.6)
     over_steps, over_time, bars = figure.subplots(1, 3, width_ratios=(1, 1, 1))
+    kinds = list(dict.fromkeys(["", *(_kind(name) for name in (*curves, *events))]))
     for name, seeds in curves.items():
-        color, dashed = _look(name)
+        color, style = _color(name), _LINES[kinds.index(_kind(name)) % len(_LINES)]
         for ax, lines in (
             (over_steps, [(one.env_steps / 1e6, one.value) for one in seeds]),
             (over_time, [(one.minutes, one.value) for one in seeds]),
@@ -126,12 +127,12 @@ def return_history(
             x, y = together(lines)
             if len(x):
                 ax.fill_between(x, y.min(axis=0), y.max(axis=0), color=color, alpha=0.16, lw=0, gid=f"spread {name}")
-                ax.plot(x, y.mean(axis=0), color=color, ls="--" if dashed else "-", lw=1.2, label=name, gid=name)
+                ax.plot(x, y.mean(axis=0), color=color, ls=style, lw=1.2, label=name, gid=name)
     over_steps.set(xlabel="env-steps [million]", ylabel="return of an episode")
     over_time.set(xlabel="wall time [min]")
     for ax in (over_steps, over_time):
         ax.set_xlim(left=0)
-    _bars(bars, events)
+    _bars(bars, events, kinds)
     for ax in (over_steps, over_time, bars):
         ax.grid(axis="y", color="#e4e7ec", lw=0.5)
         ax.set_axisbelow(True)
@@ -143,13 +144,11 @@ def return_history(
     return figure
 
 
-def _bars(ax: Axes, events: Mapping[str, Sequence[float]]) -> None:
+def _bars(ax: Axes, events: Mapping[str, Sequence[float]], kinds: Sequence[str]) -> None:
     for at, (name, values) in enumerate(events.items()):
-        color, hatched = _look(name)
+        hatch = _HATCHES[kinds.index(_kind(name)) % len(_HATCHES)]
         mean = float(np.mean(values))
-        ax.bar(
-            at, mean, color=color, alpha=0.85, hatch="////" if hatched else None, ec="white", lw=0, gid=f"bar {name}"
-        )
+        ax.bar(at, mean, color=_color(name), alpha=0.85, hatch=hatch, ec="white", lw=0, gid=f"bar {name}")
         ax.vlines(at, min(values), max(values), color="#22262e", lw=0.8)
         ax.annotate(
             f"{mean:.2g}", (at, max(values)), xytext=(0, 2), textcoords="offset points", ha="center", fontsize=6
@@ -160,10 +159,16 @@ def _bars(ax: Axes, events: Mapping[str, Sequence[float]]) -> None:
     ax.set_ylim(bottom=0)
 
 
-def _look(name: str) -> tuple[str, bool]:
-    """Colour, and whether the name has something behind a comma."""
-    first, _, more = name.partition(",")
-    return _LOOK.get(first, _GREY), bool(more)
+_LINES, _HATCHES = ("-", "--", ":"), (None, "////", "....")
+"""Of what stands behind a comma in a name, in the order in which it comes; the first is for nothing."""
+
+
+def _color(name: str) -> str:
+    return _LOOK.get(name.partition(",")[0], _GREY)
+
+
+def _kind(name: str) -> str:
+    return name.partition(",")[2].strip()
 
 
 @mpl.rc_context(PAPER)

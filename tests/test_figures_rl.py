@@ -126,7 +126,10 @@ def test_figure_5_2_draws_means_spreads_and_bars(tmp_path):
         "scratch": [History(steps, minutes, np.array([0.0, 2.0])), History(steps, minutes, np.array([2.0, 6.0]))],
         "mode 0, 10k": [History(steps, minutes, np.array([5.0, 5.0]))],
     }
+    curves["mode 0, longer"] = curves["mode 0, 10k"]
     figure = return_history(curves, {"expert": [0.25], "mode 0": [1.0, 2.0]}, note="seeds 0, 1")
+    styles = {one.get_gid(): one.get_linestyle() for one in figure.axes[0].lines}
+    assert styles == {"scratch": "-", "mode 0, 10k": "--", "mode 0, longer": ":"}
     for values in line(figure, "scratch"):
         np.testing.assert_allclose(values[[0, -1]], [1, 4])
     assert len(line(figure, "scratch")) == len(line(figure, "mode 0, 10k")) == 2
