@@ -4,6 +4,8 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import jax
@@ -33,11 +35,10 @@ Progress = Callable[[int, int], None]
 
 
 def simulate_chunks(config: SimulateConfig, skip: frozenset[range] = frozenset(), shard: Shard = WHOLE):
-    """Yields (scenes, Trajectories) for all chunks of the shard that are not in `skip`. One compile for all blocks."""
-    world, block = config.world(), block_of(config)
-    engine = make_engine(world.scene, config.engine, threads=config.threads)
-    env = SwarmEnv(world.scene, engine=engine, spawn=world.spawn, horizon=config.steps)
-    run = make_rollout(env, make_policy(config), steps=config.steps)
+    """Yields (scenes, Trajectories) for all chunks of the shard that are not in `skip`. One compile for all blocks, and
+    for all configurations that differ in scenes alone."""
+    block = block_of(config)
+    env, run = _stage(replace(config, scenes=1, seed=0, chunk=1))
     about = provenance(config, shard)
     for scenes in chunks(config, shard):
         if scenes in skip:
@@ -47,8 +48,17 @@ def simulate_chunks(config: SimulateConfig, skip: frozenset[range] = frozenset()
             # Its last scene fills up a short block: another scene might not find room for its bodies.
             keys = scene_keys(config.seed, np.minimum(np.arange(first, first + block), config.scenes - 1))
             recording = jax.device_get(run(None, env.reset(keys), keys))
-            blocks.append(from_recording(recording, world.scene, about).take(slice(0, config.scenes - first)))
+            blocks.append(from_recording(recording, env.spec, about).take(slice(0, config.scenes - first)))
         yield scenes, concatenate(blocks)
+
+
+@lru_cache(maxsize=4)
+def _stage(config: SimulateConfig):
+    """The environment and the compiled rollout of a configuration, of whatever scenes."""
+    world = config.world()
+    engine = make_engine(world.scene, config.engine, threads=config.threads)
+    env = SwarmEnv(world.scene, engine=engine, spawn=world.spawn, horizon=config.steps)
+    return env, make_rollout(env, make_policy(config), steps=config.steps)
 
 
 def make_policy(config: SimulateConfig) -> Policy:

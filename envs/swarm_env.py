@@ -52,6 +52,10 @@ def _outrun(state: State, spec: SceneSpec) -> Bool[Array, " S"]:
     return (~within & state.obstacle_present).any(axis=1)
 
 
+_spawn = jax.jit(spawn, static_argnums=(1, 2))
+"""Compiled once for all environments of equal scenes."""
+
+
 class SwarmEnv:
     """S scenes at once. `step` is callable inside `jit` and `lax.scan`; so is `spawn`; `reset` checks and may raise.
 
@@ -79,7 +83,6 @@ class SwarmEnv:
             raise SpecError("engine", self.engine.spec, "an engine made for the environment's spec")
         self.horizon = horizon
         self.terminate_on_contact = terminate_on_contact
-        self._spawn = jax.jit(self.spawn)
 
     def spawn(self, keys: Key[Array, " S"]) -> tuple[State, Bool[Array, " S"]]:
         """Starting states and whether each scene found room for its bodies."""
@@ -87,7 +90,7 @@ class SwarmEnv:
 
     def reset(self, keys: Key[Array, " S"]) -> State:
         """Starting states. Raises SpawnError when a scene has no room; inside `jit` use `spawn`."""
-        state, ok = self._spawn(keys)
+        state, ok = _spawn(keys, self.spec, self.spawn_config)
         failed = int(np.sum(~np.asarray(ok)))
         if failed:
             raise too_dense(self.spec, self.spawn_config, failed, len(ok))

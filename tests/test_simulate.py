@@ -84,6 +84,7 @@ def test_threads_change_nothing():
 
 def test_the_threads_that_were_asked_for_are_used(monkeypatch: pytest.MonkeyPatch):
     asked, make = [], simulation.make_engine
+    simulation._stage.cache_clear()
     monkeypatch.setattr(
         simulation, "make_engine", lambda *a, threads: asked.append(threads) or make(*a, threads=threads)
     )
@@ -99,6 +100,7 @@ def test_chunks_change_nothing(expected: Trajectories, chunk: int):
 def test_a_block_has_one_shape_whatever_is_asked_for(monkeypatch: pytest.MonkeyPatch):
     """What keeps the last bit: every call of the compiled rollout has the same number of scenes."""
     shapes, make = [], simulation.make_rollout
+    simulation._stage.cache_clear()
 
     def spied(*args, **kwargs):
         run = make(*args, **kwargs)
@@ -107,6 +109,7 @@ def test_a_block_has_one_shape_whatever_is_asked_for(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(simulation, "make_rollout", spied)
     for scenes, chunk in ((1, 1), (BLOCK + 1, 7), (BLOCK + 1, 1000)):
         assert len(simulate_in_memory(replace(CONFIG, scenes=scenes, chunk=chunk, steps=1))) == scenes
+    simulation._stage.cache_clear()
     assert shapes == [BLOCK] * 5
     assert block_of(CONFIG) == BLOCK
 

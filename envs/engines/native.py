@@ -2,7 +2,8 @@
 
 import collections
 import contextlib
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -54,10 +55,16 @@ def _bodies_of(model: mujoco.MjModel, spec: SceneSpec) -> slice:
     return slice(first, first + 4 * n)
 
 
-def _unpacked(bodies: Array) -> dict[str, Array]:
-    """Fields of the state from (S, 4N)."""
-    halves = bodies.reshape(bodies.shape[0], 2, -1, 2)
-    return {"position": halves[:, 0], "velocity": halves[:, 1]}
+def _rows(*parts: Array) -> Array:
+    """Arrays (S, ...) as one (S, W) of the first one's dtype."""
+    return jnp.concatenate([part.reshape(len(part), -1).astype(parts[0].dtype) for part in parts], axis=1)
+
+
+def _parts(rows: Array, *shapes: tuple[int, ...]) -> list:
+    """The arrays (S, *shape) that make up (S, W); all of them views where `rows` is of NumPy."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    columns = [rows[:, end - math.prod(shape) : end] for end, shape in zip(ends, shapes, strict=True)]
+    return [part.reshape(len(rows), *shape) for part, shape in zip(columns, shapes, strict=True)]
 
 
 class NativeEngine:
@@ -80,46 +87,48 @@ class NativeEngine:
             self._mover.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._index = SceneIndex.of(self._model, spec)
         self._bodies = _bodies_of(self._model, spec)
+        agents = spec.num_agents
+        # Columns of a state that hold qpos and qvel.
+        self._moved = slice(self._bodies.start, self._bodies.start + 4 * agents)
+        # What a control step gives: position, velocity, touching flags (agent, wall, obstacle), counts, depths.
+        flags = ((agents,), (agents,), (agents, spec.num_obstacles))
+        self._seen = ((agents, 2), (agents, 2), *flags, (len(_COUNTS), agents), (len(_DEPTHS), agents))
         self._pool: dict[int, collections.deque[_Worker]] = collections.defaultdict(collections.deque)
 
     def step(self, state: State, acceleration: Float[Array, "S N 2"]) -> tuple[State, Contacts]:
         """One control step of `substeps` physics steps; contacts of states 1..k."""
         scenes, agents, _ = state.position.shape
-        dtype = state.position.dtype
-        # Few arrays cross the border, the bodies as MuJoCo lays them out (qpos, qvel, warm start, ctrl): one copy in,
-        # one copy out.
-        still = jnp.zeros_like(state.position)
-        parts = (state.position, state.velocity, still, acceleration.astype(dtype))
-        bodies = jnp.concatenate([part.reshape(scenes, -1) for part in parts], axis=1)
-        moved = jax.ShapeDtypeStruct((scenes, 4 * agents), dtype)
-        path = obstacle_path(state, self.spec)
-        after = with_obstacles_moved(state, path, self.spec)
-        if not self.spec.contacts:
-            out = jax.pure_callback(self._advance, moved, bodies, state.obstacle, vmap_method="sequential")
-            return replace(after, **_unpacked(out)), no_contacts(scenes, agents)
-        if not self.spec.moving_obstacles:
+        spec = self.spec
+        # One array crosses the border each way: what an array costs there is more than its copy. First the bodies as
+        # MuJoCo lays them out (qpos, qvel, warm start, ctrl).
+        bodies = (state.position, state.velocity, jnp.zeros_like(state.position), acceleration)
+        path = obstacle_path(state, spec)
+        after = with_obstacles_moved(state, path, spec)
+
+        def called(function: Callable[[Array], np.ndarray], rows: Array, width: int) -> Array:
+            shape = jax.ShapeDtypeStruct((scenes, width), rows.dtype)
+            return jax.pure_callback(function, shape, rows, vmap_method="sequential")
+
+        if not spec.contacts:
+            out = called(self._advance, _rows(*bodies, state.obstacle), 4 * agents)
+            position, velocity = _parts(out, (agents, 2), (agents, 2))
+            return replace(after, position=position, velocity=velocity), no_contacts(scenes, agents)
+        if not spec.moving_obstacles:
             path = path[:, :1]  # placed once, for all substeps
-        flags = jnp.concatenate(
-            [state.touching_agent[..., None], state.touching_wall[..., None], state.touching_obstacle], axis=-1
-        )
-        shapes = (
-            moved,
-            jax.ShapeDtypeStruct(flags.shape, flags.dtype),
-            jax.ShapeDtypeStruct((len(_COUNTS), scenes, agents), np.int32),
-            jax.ShapeDtypeStruct((len(_DEPTHS), scenes, agents), np.float32),
-        )
-        arguments = (bodies, path, flags, self._near(after, acceleration))
-        out, flags, counts, depths = jax.pure_callback(
-            self._advance_with_contacts, shapes, *arguments, vmap_method="sequential"
-        )
+        flags = (state.touching_agent, state.touching_wall, state.touching_obstacle)
+        rows = _rows(*bodies, path, self._near(after, acceleration), *flags)
+        out = called(self._advance_with_contacts, rows, sum(math.prod(shape) for shape in self._seen))
+        position, velocity, agent, wall, obstacle, counts, depths = _parts(out, *self._seen)
         after = replace(
             after,
-            **_unpacked(out),
-            touching_agent=flags[..., 0],
-            touching_wall=flags[..., 1],
-            touching_obstacle=flags[..., 2:],
+            position=position,
+            velocity=velocity,
+            touching_agent=agent > 0,
+            touching_wall=wall > 0,
+            touching_obstacle=obstacle > 0,
         )
-        fields = dict(zip(_COUNTS + _DEPTHS, [*counts, *depths], strict=True))
+        fields = {name: counts[:, i].astype(jnp.int32) for i, name in enumerate(_COUNTS)}
+        fields |= {name: depths[:, i].astype(jnp.float32) for i, name in enumerate(_DEPTHS)}
         return after, Contacts(**fields, saturated=jnp.zeros(scenes, jnp.int32))
 
     @contextlib.contextmanager
@@ -164,20 +173,20 @@ class NativeEngine:
         places[:, :, self._index.obstacle_mocap, :2] = path[:, :-1]
         return places.reshape(*places.shape[:2], -1)
 
-    def _moved(self, batch: Batch, bodies: np.ndarray) -> Float[np.ndarray, "S M"]:
-        """Positions and velocities of all agents, (S, 4N)."""
-        return batch.state[:, self._bodies.start : self._bodies.start + bodies.shape[1] // 2].astype(bodies.dtype)
-
-    def _advance(self, bodies: Array, obstacle: Array) -> np.ndarray:
-        bodies = np.asarray(bodies)
-        with self._loaded(bodies, np.asarray(obstacle)) as worker:
+    def _advance(self, rows: Array) -> np.ndarray:
+        agents, obstacles = self.spec.num_agents, self.spec.num_obstacles
+        bodies, obstacle = _parts(np.asarray(rows), (8 * agents,), (obstacles, 2))
+        with self._loaded(bodies, obstacle) as worker:
             worker.batch.step(nstep=self.spec.substeps)
-            return self._moved(worker.batch, bodies)
+            return worker.batch.state[:, self._moved].astype(rows.dtype)
 
-    def _advance_with_contacts(self, bodies: Array, path: Array, flags: Array, near: Array) -> tuple:
-        bodies, path, flags, near = (np.asarray(x) for x in (bodies, path, flags, near))
-        k, index = self.spec.substeps, self._index
-        scenes, agents = len(bodies), self.spec.num_agents
+    def _advance_with_contacts(self, rows: Array) -> np.ndarray:
+        k, index, spec = self.spec.substeps, self._index, self.spec
+        agents, obstacles = spec.num_agents, spec.num_obstacles
+        instants = k + 1 if spec.moving_obstacles else 1
+        flags = ((agents,), (agents,), (agents, obstacles))
+        bodies, path, near, *before = _parts(np.asarray(rows), (8 * agents,), (instants, obstacles, 2), (), *flags)
+        scenes = len(bodies)
         with self._loaded(bodies, path[:, 0]) as worker:
             batch, look = worker.batch, worker.look
             if k == 1:
@@ -190,26 +199,23 @@ class NativeEngine:
                 # A record describes the state before its substep: sensors 1.. are those of states 1..k-1.
                 recorded, positions = worker.records["sensordata"][:, 1:], worker.records["qpos"]
                 touched = worker.records["ncon"].reshape(scenes, k).any(axis=1)
-            moved = self._moved(batch, bodies)
-            if self.spec.moving_obstacles:
-                batch.mocap_pos[:, index.obstacle_mocap, :2] = path[:, k]
-
             # Scenes where nothing touches, most of them, are done: zeros.
-            now = np.zeros_like(flags)
-            counts = np.zeros((len(_COUNTS), scenes, agents), np.int32)
-            depths = np.zeros((len(_DEPTHS), scenes, agents), np.float32)
-            rows = np.flatnonzero(touched | near)
-            if len(rows):
-                look.state[rows] = batch.state[rows]
-                look.forward(ids=rows, stage=mujoco.mjtStage.mjSTAGE_POS.value)  # state k
-                sensors = np.concatenate([recorded[rows], look.sensordata[rows, None]], axis=1)
-                before = (flags[rows, :, 0], flags[rows, :, 2:], flags[rows, :, 1])
-                (agent, solid, wall), on_agent, fields = read_sensors(np, sensors, before, index, self.spec)
-                now[rows] = np.concatenate([agent[..., None], wall[..., None], solid], axis=-1)
-                counts[:, rows] = [fields[name] for name in _COUNTS]
-                fields["agent_depth"] = self._agent_depth(on_agent, positions, rows)
-                depths[:, rows] = [fields[name] for name in _DEPTHS]
-        return moved, now, counts, depths
+            out = np.zeros((scenes, sum(math.prod(shape) for shape in self._seen)), rows.dtype)
+            out[:, : 4 * agents] = batch.state[:, self._moved]
+            if spec.moving_obstacles:
+                batch.mocap_pos[:, index.obstacle_mocap, :2] = path[:, k]
+            chosen = np.flatnonzero(touched | (near > 0))
+            if len(chosen):
+                look.state[chosen] = batch.state[chosen]
+                look.forward(ids=chosen, stage=mujoco.mjtStage.mjSTAGE_POS.value)  # state k
+                sensors = np.concatenate([recorded[chosen], look.sensordata[chosen, None]], axis=1)
+                agent, wall, obstacle = (flag[chosen] > 0 for flag in before)
+                now, on_agent, fields = read_sensors(np, sensors, (agent, obstacle, wall), index, spec)
+                fields["agent_depth"] = self._agent_depth(on_agent, positions, chosen)
+                agent, obstacle, wall = now
+                seen = [agent, wall, obstacle, *(fields[name] for name in _COUNTS + _DEPTHS)]
+                out[chosen, 4 * agents :] = np.concatenate([x.reshape(len(chosen), -1) for x in seen], axis=1)
+        return out
 
     def _near(self, state: State, acceleration: Float[Array, "S N 2"]) -> Bool[Array, " S"]:
         """Whether two bodies may touch at state k if none does before; where not, all its sensors are zero for sure."""
