@@ -4,6 +4,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import jax
@@ -48,7 +49,7 @@ class Model:
 
         return parts(self.about)
 
-    @property
+    @cached_property
     def predict(self) -> Predict:
         """`predict(params, history (B, W, V, 4), graph, horizon=h) -> (B, h, V, 4)`."""
         return make_family(self.config, self.scales, self.integrator).predict

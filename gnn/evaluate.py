@@ -84,22 +84,22 @@ def prediction_error(
     horizons = tuple(h for h in sorted(horizons) if window + h <= rows) or (min(horizons),)
     check_rows(trajectories, window + horizons[0], f"a prediction of {horizons[0]} steps from {window}")
     longest = horizons[-1]
-    data, counts = Dataset.of(trajectories), trajectories.counts
+    data, counts = jax.tree.map(np.asarray, Dataset.of(trajectories)), trajectories.counts
     # Every start that fits the shortest horizon; what lies beyond the end of a trajectory is masked.
     starts = rows - window - horizons[0] + 1
     padded = longest + starts - 1 + window - rows
-    run = jax.jit(partial(_batch_errors, predict, window=window, horizon=longest, counts=counts, starts=starts))
     first_agent = counts[0] + counts[1]
     sums, moved = [], np.zeros((3, longest))
     for first in range(0, len(trajectories), scenes_per_batch):
         chosen = np.arange(first, first + scenes_per_batch).clip(max=len(trajectories) - 1)
         batch = jax.tree.map(lambda x, chosen=chosen: x[chosen], data)
         batch = Dataset(
-            states=jnp.pad(batch.states, ((0, 0), (0, padded), (0, 0), (0, 0))),
-            mask=jnp.pad(batch.mask, ((0, 0), (0, padded), (0, 0))),
+            states=np.pad(batch.states, ((0, 0), (0, padded), (0, 0), (0, 0))),
+            mask=np.pad(batch.mask, ((0, 0), (0, padded), (0, 0))),
             edges=batch.edges,
         )
-        square, count, displaced = (np.asarray(x, np.float64) for x in run(params, batch))
+        found = _batch_errors(predict, params, batch, window=window, horizon=longest, counts=counts, starts=starts)
+        square, count, displaced = (np.asarray(x, np.float64) for x in found)
         real = min(scenes_per_batch, len(trajectories) - first)
         sums.append((square[: real * starts], count[: real * starts]))
         moved += displaced[: real * starts].sum(axis=0)
@@ -149,6 +149,7 @@ def _mean(square: np.ndarray, count: np.ndarray) -> np.ndarray:
     return np.divide(square.sum(axis=(1, 2)), 4 * total, out=np.full(len(total), np.nan), where=total > 0)
 
 
+@partial(jax.jit, static_argnames=("predict", "window", "horizon", "counts", "starts"))
 def _batch_errors(
     predict: Predict,
     params: Params,

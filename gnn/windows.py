@@ -1,5 +1,8 @@
 """Trajectories on the device and windows of them: histories to predict from and the rows that follow."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -34,6 +37,7 @@ def check_rows(trajectories: Trajectories, rows: int, why: str) -> None:
         raise TrajectoryError(f"trajectories have {have} rows, {why} needs at least {rows}")
 
 
+@partial(jax.jit, static_argnames=("window", "horizon", "counts"))
 def windows(
     data: Dataset,
     scene: Int[Array, " B"],
