@@ -7,7 +7,7 @@ the global step, so weights, optimizer and n are the full state: a continued run
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -24,10 +24,11 @@ from gnn.checkpoint import CheckpointError, Checkpoints, Model, describe
 from gnn.config import AnyModelConfig, TrainConfig, model_preset
 from gnn.decode import Integrator
 from gnn.evaluate import natural_change
-from gnn.family import Family, Params, Predict
+from gnn.family import Family, Params
 from gnn.features import Scales
-from gnn.freeze import Mask, free_leaves, frozen, paths_of
+from gnn.freeze import free_leaves, frozen, paths_of
 from gnn.freeze import freeze as freezing
+from gnn.graph import Graph
 from gnn.metrics import Metrics
 from gnn.ranges import figures_of
 from gnn.registry import make_family
@@ -66,6 +67,33 @@ def train(
 
 
 @dataclass(frozen=True)
+class Recipe:
+    """What the compiled functions of a training depend on besides arrays: equal recipes share them."""
+
+    config: TrainConfig
+    """Without what is a number to them, see `without_numbers`."""
+    preset: AnyModelConfig
+    integrator: Integrator
+    counts: tuple[int, int, int]
+    """Goals, obstacles and agents."""
+    freeze: tuple[str, ...]
+
+    @staticmethod
+    def without_numbers(config: TrainConfig) -> TrainConfig:
+        """The settings with the same seed, stages and pace of saving for all."""
+        return replace(config, seed=0, horizons=(1,), stage_steps=(config.chunk,), checkpoint_seconds=1.0)
+
+    def family(self, scales: Scales) -> Family:
+        """The model's functions."""
+        return make_family(self.preset, scales, self.integrator)
+
+    def optimizer(self, params: Params) -> optax.GradientTransformation:
+        """Adam behind a clip, for the weights that are free; `params` may be their shapes."""
+        chain = optax.chain(optax.clip_by_global_norm(self.config.clip_norm), optax.scale_by_adam())
+        return freezing(chain, frozen(params, self.freeze))
+
+
+@dataclass(frozen=True)
 class Prepared:
     """All that one training consists of but its folder. Nothing compiled depends on the number of steps."""
 
@@ -79,7 +107,7 @@ class Prepared:
     start: Callable[[], dict]
     """The state before the first step: weights, optimizer, step."""
     run_chunk: Callable[..., tuple[dict, Array, Array]]
-    """`(state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`; one compile per horizon."""
+    """`(state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`, see `run_chunk`."""
     measure: Callable[[Params], Array]
     """The validation error of weights."""
 
@@ -113,14 +141,13 @@ def prepare(
     integrator = Integrator(
         trajectories.dt, trajectories.substeps, trajectories.max_speed, trajectories.max_acceleration
     )
-    family = make_family(preset, scales, integrator)
-    data, counts = Dataset.of(trajectories), trajectories.counts
-    first = partial(_first_weights, config, family, data, counts)
+    data = Dataset.of(trajectories)
+    recipe = Recipe(Recipe.without_numbers(config), preset, integrator, trajectories.counts, tuple(freeze))
+    first = partial(_first_weights, recipe, scales, config.seed, data)
     shapes = jax.eval_shape(first)
     if initial is not None:
         _check_weights(initial.params, shapes)
-    mask = frozen(shapes, freeze)
-    optimizer = freezing(optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.scale_by_adam()), mask)
+    optimizer = recipe.optimizer(shapes)
 
     def start() -> dict:
         params = first() if initial is None else jax.tree.map(jnp.asarray, initial.params)
@@ -140,8 +167,8 @@ def prepare(
         },
         data=data,
         start=start,
-        run_chunk=_make_chunk(config, family, scales, optimizer, mask, counts),
-        measure=_make_validation(family.predict, validation or trajectories, preset.window, furthest),
+        run_chunk=partial(run_chunk, recipe, scales, config.seed),
+        measure=_make_validation(recipe, scales, validation or trajectories, furthest),
     )
 
 
@@ -225,23 +252,39 @@ def _check_weights(params: Params, shapes: Params) -> None:
         raise SpecError("initial", ", ".join(different), "weights for the same kinds of nodes as in the data")
 
 
-def _first_weights(config: TrainConfig, family: Family, data: Dataset, counts: tuple[int, int, int]) -> Params:
+def _first_weights(recipe: Recipe, scales: Scales, seed: int, data: Dataset) -> Params:
     zero = jnp.zeros(1, jnp.int32)
-    history, _, _, graph = windows(data, zero, zero, window=model_preset(config.model).window, horizon=1, counts=counts)
-    # Without `jit` every layer's draw would compile for itself.
-    return jax.jit(family.init)(jax.random.key(config.seed), history, graph)
+    history, _, _, graph = windows(data, zero, zero, window=recipe.preset.window, horizon=1, counts=recipe.counts)
+    return _initial(recipe, scales, seed, history, graph)
 
 
-def _make_chunk(
-    config: TrainConfig, family: Family, scales: Scales, optimizer, mask: Mask, counts: tuple[int, int, int]
-) -> Callable[..., tuple[dict, Array, Array]]:
-    """See `Prepared.run_chunk`."""
-    window = model_preset(config.model).window
+@partial(jax.jit, static_argnums=0)
+def _initial(recipe: Recipe, scales: Scales, seed: int | Array, history: Array, graph: Graph) -> Params:
+    return recipe.family(scales).init(jax.random.key(seed), history, graph)
+
+
+@partial(jax.jit, static_argnums=0, static_argnames="horizon")
+def run_chunk(
+    recipe: Recipe,
+    scales: Scales,
+    seed: int | Array,
+    state: dict,
+    data: Dataset,
+    steps: int | Array,
+    *,
+    horizon: int,
+) -> tuple[dict, Array, Array]:
+    """`config.chunk` gradient steps of `steps` in all: the state after them, mean loss and mean gradient norm.
+
+    One compile for a horizon, whatever the seed, the scales and the number of steps.
+    """
+    config, preset, counts = recipe.config, recipe.preset, recipe.counts
+    family, window = recipe.family(scales), preset.window
     noise_unit = config.noise * jnp.stack(
         [scales.position_change, scales.position_change, scales.velocity_change, scales.velocity_change]
     )
 
-    def loss_of(params: dict, data: Dataset, key: Key[Array, ""], horizon: int) -> Array:
+    def loss_of(params: dict, key: Key[Array, ""]) -> Array:
         k_scene, k_start, k_noise, k_model = jax.random.split(key, 4)
         scenes, rows = data.states.shape[:2]
         scene = jax.random.randint(k_scene, (config.batch,), 0, scenes)
@@ -253,42 +296,45 @@ def _make_chunk(
             history = history + jnp.where(moving[:, None, :, None], noise, 0)
         return family.loss(params, history, truth, mask, graph, k_model)
 
-    @partial(jax.jit, static_argnames="horizon")
-    def run_chunk(state: dict, data: Dataset, steps: int | Array, *, horizon: int):
-        def one(state: dict, _: None):
-            step, raw = state["step"], state["raw" if config.average else "params"]
-            key = jax.random.fold_in(jax.random.key(config.seed + 1), step)
-            loss, gradient = jax.value_and_grad(loss_of)(raw, data, key, horizon)
-            updates, opt_state = optimizer.update(gradient, state["optimizer"], raw)
-            rate = 0.5 * config.learning_rate * (1 + jnp.cos(jnp.pi * step / steps))
-            raw = optax.apply_updates(raw, jax.tree.map(lambda update: -rate * update, updates))
-            new = {"params": raw, "optimizer": opt_state, "step": step + 1}
-            if config.average:
-                # The first steps leave the initial weights behind: the mean begins short and grows.
-                keep = jnp.minimum(config.average, (1 + step) / (10 + step))
-                new["params"] = jax.tree.map(lambda mean, now: mean + (1 - keep) * (now - mean), state["params"], raw)
-                new["raw"] = raw
-            return new, (loss, optax.tree.norm(free_leaves(gradient, mask)))
+    optimizer, mask = recipe.optimizer(state["params"]), frozen(state["params"], recipe.freeze)
 
-        state, (loss, norm) = jax.lax.scan(one, state, None, length=config.chunk)
-        return state, loss.mean(), norm.mean()
+    def one(state: dict, _: None):
+        step, raw = state["step"], state["raw" if config.average else "params"]
+        key = jax.random.fold_in(jax.random.key(seed + 1), step)
+        loss, gradient = jax.value_and_grad(loss_of)(raw, key)
+        updates, opt_state = optimizer.update(gradient, state["optimizer"], raw)
+        rate = 0.5 * config.learning_rate * (1 + jnp.cos(jnp.pi * step / steps))
+        raw = optax.apply_updates(raw, jax.tree.map(lambda update: -rate * update, updates))
+        new = {"params": raw, "optimizer": opt_state, "step": step + 1}
+        if config.average:
+            # The first steps leave the initial weights behind: the mean begins short and grows.
+            keep = jnp.minimum(config.average, (1 + step) / (10 + step))
+            new["params"] = jax.tree.map(lambda mean, now: mean + (1 - keep) * (now - mean), state["params"], raw)
+            new["raw"] = raw
+        return new, (loss, optax.tree.norm(free_leaves(gradient, mask)))
 
-    return run_chunk
+    state, (loss, norm) = jax.lax.scan(one, state, None, length=config.chunk)
+    return state, loss.mean(), norm.mean()
 
 
-def _make_validation(predict: Predict, trajectories: Trajectories, window: int, horizon: int):
+def _make_validation(recipe: Recipe, scales: Scales, trajectories: Trajectories, horizon: int):
     """`params -> normalized error` (`agents`, see `gnn.evaluate`) over `horizon` steps of a fixed sample of windows."""
-    data, counts = Dataset.of(trajectories), trajectories.counts
+    data, counts, window = Dataset.of(trajectories), trajectories.counts, recipe.preset.window
     rng = np.random.default_rng(0)
     scene = jnp.asarray(rng.integers(0, len(trajectories), VALIDATION_WINDOWS))
     start = jnp.asarray(rng.integers(0, trajectories.position.shape[1] - window - horizon + 1, VALIDATION_WINDOWS))
     history, truth, mask, graph = windows(data, scene, start, window=window, horizon=horizon, counts=counts)
-    mask = mask & (jnp.arange(sum(counts)) >= counts[0] + counts[1])
     unit = natural_change(trajectories)[1]
+    return lambda params: _validation_error(recipe, scales, params, history, truth, mask, graph) / unit
 
-    @jax.jit
-    def measure(params: dict) -> Array:
-        square = jnp.mean((predict(params, history, graph, horizon=horizon) - truth) ** 2, axis=-1)
-        return jnp.sum(jnp.where(mask, square, 0)) / jnp.maximum(mask.sum(), 1) / unit
 
-    return measure
+@partial(jax.jit, static_argnums=0)
+def _validation_error(
+    recipe: Recipe, scales: Scales, params: Params, history: Array, truth: Array, mask: Array, graph: Graph
+) -> Array:
+    """Mean squared error of agents' states."""
+    goals, obstacles, _ = graph.counts
+    predicted = recipe.family(scales).predict(params, history, graph, horizon=truth.shape[1])
+    mask = mask & (jnp.arange(mask.shape[-1]) >= goals + obstacles)
+    square = jnp.mean((predicted - truth) ** 2, axis=-1)
+    return jnp.sum(jnp.where(mask, square, 0)) / jnp.maximum(mask.sum(), 1)

@@ -358,13 +358,16 @@ def test_jobs_share_the_cells_and_end_with_the_command(fake: Fake, tmp_path: Pat
         def terminate(self):
             self.said.append("terminated")
 
+        def communicate(self):
+            self.said.append("let go")
+
     monkeypatch.setattr(command, "subprocess", types.SimpleNamespace(Popen=Helper, DEVNULL=None, PIPE=None))
     monkeypatch.setattr(command, "find", lambda name: fake.experiment)
     config = Reproduce(name="fake", out=tmp_path, jobs=2)
     assert command.run(config) == 0
     ((words, helper),) = started
     assert parse(words[3:]) == replace(config, jobs=1)
-    assert helper.said == ["waited for", "terminated", "waited for"]
+    assert helper.said == ["waited for", "terminated", "let go"]
     assert len(fake.calls) == len(set(fake.calls)) == len(fake.experiment.cells((0,)))
     assert fake.calls[-1] == first
     whole = Reproduce(

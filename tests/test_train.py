@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from learning import quick_training, spring, tiny
 
-import gnn.train
 from envs.trajectories import TrajectoryError
 from gnn.checkpoint import CheckpointError, Checkpoints, load_model
 from gnn.config import TrainConfig
 from gnn.decode import make_predict
 from gnn.evaluate import persistence, prediction_error
 from gnn.metrics import read_metrics
-from gnn.train import TrainError, prepare, train
+from gnn.train import TrainError, prepare, run_chunk, train
 from swarm_mjcf.errors import SpecError
 from swarmnet.bench_train import bench_loop, windows_of
 
@@ -70,19 +69,21 @@ def test_the_validation_error_of_the_metrics_is_the_error_on_the_scenes_kept_out
     np.testing.assert_allclose(last["validation_error"], found.agents_mean[0], rtol=1e-4)
 
 
-def test_horizons_come_in_the_order_of_the_curriculum_with_one_compile_each(tmp_path: Path, monkeypatch):
-    compiled = []
-    make_chunk = gnn.train._make_chunk
-    monkeypatch.setattr(gnn.train, "_make_chunk", lambda *a: compiled.append(make_chunk(*a)) or compiled[-1])
-    seen = []
-    model = train(SHORT, spring(), tmp_path, progress=lambda done, total, row: seen.append((done, total, row)))
+def test_horizons_come_in_the_order_of_the_curriculum_with_one_compile_each(tmp_path: Path):
+    """None for another seed, other scales and other stages of the same horizons."""
+    compiled, seen = run_chunk._cache_size(), []
+    own = replace(SHORT, learning_rate=1.7e-3)  # which no other test has compiled
+    model = train(own, spring(), tmp_path / "one", progress=lambda done, total, row: seen.append((done, total, row)))
+    assert run_chunk._cache_size() == compiled + 2
+    again = train(replace(own, seed=1, stage_steps=(2, 2)), spring(seed=3), tmp_path / "other")
+    assert run_chunk._cache_size() == compiled + 2
+    assert not np.array_equal(again.scales.position, model.scales.position)
     assert [(done, total) for done, total, _ in seen] == [(2, 10), (4, 10), (6, 10), (8, 10), (10, 10)]
-    rows = read_metrics(tmp_path / "metrics.jsonl")
+    rows = read_metrics(tmp_path / "one" / "metrics.jsonl")
     assert [(row["step"], row["stage"], row["horizon"]) for row in rows] == [
         (2, 0, 1), (4, 0, 1), (6, 0, 1), (8, 1, 3), (10, 1, 3),
     ]  # fmt: skip
     assert [{k: v for k, v in row.items() if k != "step"} for row in rows] == [row for _, _, row in seen]
-    assert compiled[0]._cache_size() == 2
     assert model.about["step"] == 10
 
 

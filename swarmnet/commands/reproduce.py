@@ -69,7 +69,7 @@ def helpers(config: Reproduce) -> Iterator[list[subprocess.Popen]]:
     finally:
         for helper in running:
             helper.terminate()
-            helper.wait()
+            helper.communicate()  # waits, and closes what held it
 
 
 def arguments(config: Reproduce) -> list[str]:
