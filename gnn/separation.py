@@ -22,7 +22,8 @@ from envs.state import State, make_state
 from envs.trajectories import AGENT, GOAL, OBSTACLE, Trajectories
 from gnn.checkpoint import Model
 from gnn.evaluate import PredictionError, prediction_error
-from gnn.graph import EDGE_TYPES, graph_of_edges
+from gnn.forecast import forecast
+from gnn.graph import EDGE_TYPES
 from gnn.laws import check_kinds, same_rules
 from gnn.windows import check_rows
 
@@ -49,7 +50,7 @@ class Column:
     """Of the network with these edges, against `truth`; normalized by the changes in `truth` itself."""
     truth: Trajectories
     """The expert with the same rules, from the same starts."""
-    predicted: Float[np.ndarray, "S T V 4"]
+    predicted: Trajectories
     """The network from the first rows of `truth` alone; those rows are repeated."""
 
 
@@ -74,7 +75,7 @@ def separation(
         truth = with_only(rerun(trajectories, expert, kinds, walls_stay=walls_stay), kinds)
         window = model.config.window
         error = prediction_error(model.predict, model.params, truth, window=window, horizons=HORIZONS)
-        made[name] = Column(kinds, error, truth, predicted_from_start(model, truth.take(slice(0, shown))))
+        made[name] = Column(kinds, error, truth, forecast(model, truth.take(slice(0, shown))))
     return made
 
 
@@ -148,17 +149,4 @@ def state_of(trajectories: Trajectories, row: int = 0) -> State:
         obstacle_velocity=velocity[:, obstacles],
         agent_present=there[:, agents],
         obstacle_present=there[:, obstacles],
-    )
-
-
-def predicted_from_start(model: Model, trajectories: Trajectories) -> Float[np.ndarray, "S T V 4"]:
-    """The network's states from the first `window` rows on, never corrected; those rows come first."""
-    rows, window = trajectories.position.shape[1], model.config.window
-    check_rows(trajectories, window + 1, "a prediction")
-    states = np.concatenate([trajectories.position, trajectories.velocity], axis=-1)
-    present = jnp.asarray(trajectories.mask[:, :window].all(axis=1))
-    graph = graph_of_edges(jnp.asarray(trajectories.edges), present, trajectories.counts)
-    run = jax.jit(model.predict, static_argnames="horizon")
-    return np.concatenate(
-        [states[:, :window], np.asarray(run(model.params, states[:, :window], graph, horizon=rows - window))], axis=1
     )

@@ -114,8 +114,8 @@ def separation_figure(columns: dict[str, Column], scenes: tuple[int, ...] = (0, 
     for scene in scenes:
         for name, column in columns.items():
             truth = _felt(column.truth.take([scene]), column.kinds)
-            states = column.predicted[[scene]]
-            solid.append(replace(truth, position=states[..., :2], velocity=states[..., 2:]))
+            guess = column.predicted.take([scene])
+            solid.append(replace(truth, position=guess.position, velocity=guess.velocity))
             dashed.append(truth)
             error = dict(zip(column.error.horizons, column.error.published_mean, strict=True))
             figures = " / ".join(f"{error[h]:.2g}" for h in HORIZONS if h in error)

@@ -25,7 +25,7 @@ from envs.swarm_env import SwarmEnv, scene_keys
 from envs.trajectories import Trajectories, from_recording, versions
 from gnn.checkpoint import Model
 from gnn.evaluate import PredictionError
-from gnn.windows import Dataset, windows
+from gnn.forecast import forecast
 from swarm_mjcf.errors import SwarmError
 from swarmnet.closed_loop import Stage, replayed, roll_out
 from swarmnet.out_of_range import out_of_range
@@ -303,22 +303,8 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
     )
     recording = jax.device_get(make_rollout(env, make_expert(world.expert), steps=steps)(None, start, keys))
     truth = from_recording(recording, world.scene, {"policy": "expert", "seed": seed, "world": plain(world)})
-    predict = model.predict
-    first = model.config.window
-    scene, zero = jnp.arange(4), jnp.zeros(4, jnp.int32)
-    history, future, _, graph = windows(
-        Dataset.of(truth), scene, zero, window=first, horizon=steps + 1 - first, counts=truth.counts
-    )
-    states = np.concatenate([history, predict(model.params, history, graph, horizon=future.shape[1])], axis=1)
-    states = np.where(truth.mask[..., None], states, 0).astype(np.float32)
-    predicted = replace(
-        truth,
-        position=states[..., :2],
-        velocity=states[..., 2:],
-        provenance=truth.provenance | {"policy": "prediction"},
-    )
     save(folder / "rollouts" / "sweep_truth.h5", truth)
-    save(folder / "rollouts" / "sweep_predicted.h5", predicted)
+    save(folder / "rollouts" / "sweep_predicted.h5", forecast(model, truth))
 
 
 def tables(judgement: Judgement) -> str:

@@ -15,6 +15,7 @@ from envs.trajectories import AGENT, GOAL, OBSTACLE, Trajectories, TrajectoryErr
 from gnn.checkpoint import Model
 from gnn.config import TrainConfig
 from gnn.evaluate import natural_change, prediction_error
+from gnn.forecast import forecast
 from swarm_mjcf.build import OBSTACLE_COLOR, agent_color
 from swarm_mjcf.errors import SpecError
 from swarmnet.figures_thesis import (
@@ -32,7 +33,7 @@ from swarmnet.reproduce.experiment import Cell, Effort
 from swarmnet.reproduce.figures_3 import FIGURE_3_6, FIGURE_3_8, SIZES
 from swarmnet.reproduce.figures_4 import FIGURE_4_4, PAIRS
 from swarmnet.reproduce.norms import norms
-from swarmnet.reproduce.shown import keep, panels, predicted, scene_errors, show, until
+from swarmnet.reproduce.shown import keep, panels, scene_errors, show, until
 
 DT = 0.5
 
@@ -180,7 +181,7 @@ def test_predictions_start_from_the_first_rows_alone(still) -> None:
     truth = scene(rows=12)
     velocity = truth.velocity.copy()
     velocity[0, 0, 2] = (0, 3)
-    guess = predicted(still, replace(truth, velocity=velocity))
+    guess = forecast(still, replace(truth, velocity=velocity))
     assert guess.provenance["given"] == 1
     np.testing.assert_allclose(guess.position[0, :, 2], np.stack([np.zeros(12), 3 * DT * np.arange(12)], -1), atol=1e-4)
     np.testing.assert_allclose(guess.position[0, :10, 3], truth.position[0, :10, 3], atol=1e-4)
@@ -191,7 +192,7 @@ def test_agents_that_overflow_are_absent_and_their_error_is_infinite(still) -> N
     truth = scene(rows=12)
     params = jax.tree.map(lambda leaf: leaf, still.params)
     params["readout"]["layer0"]["bias"] = np.array([1e38, 0], np.float32)
-    guess = predicted(replace(still, params=params), truth)
+    guess = forecast(replace(still, params=params), truth)
     assert not guess.mask[0, -1, 2]
     assert guess.mask[0, :, :2].all()
     assert np.isinf(scene_errors(truth, guess, 1)).all()

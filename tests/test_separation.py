@@ -9,8 +9,10 @@ from learning import published, quick_compiles
 
 from envs.experts.config import BoidsConfig, ChaserConfig, HelbingConfig
 from envs.trajectories import AGENT, OBSTACLE, Trajectories, TrajectoryError
+from gnn.checkpoint import Model
+from gnn.forecast import forecast
 from gnn.laws import LawError, same_rules
-from gnn.separation import COLUMNS, predicted_from_start, rerun, separation, state_of, with_only
+from gnn.separation import COLUMNS, rerun, separation, state_of, with_only
 from swarm_mjcf.errors import SpecError
 from swarmnet.figures_probe import separation_figure
 
@@ -33,6 +35,11 @@ def permuted(t: Trajectories, order: np.ndarray) -> Trajectories:
     )
 
 
+def foreseen(model: Model, scenes: Trajectories) -> np.ndarray:
+    guess = forecast(model, scenes)
+    return np.concatenate([guess.position, guess.velocity], axis=-1)
+
+
 # --- subsets ---
 
 
@@ -40,9 +47,9 @@ def permuted(t: Trajectories, order: np.ndarray) -> Trajectories:
 def test_an_edge_type_switched_off_equals_data_without_its_node(name: str):
     model, scenes = random_model(name), flock(3, 9)
     gone = scenes.mask & (scenes.kind != OBSTACLE)[:, None]
-    absent = predicted_from_start(model, replace(scenes, mask=gone))
-    off = predicted_from_start(model, with_only(scenes, ("goal", "agent")))
-    on = predicted_from_start(model, scenes)
+    absent = foreseen(model, replace(scenes, mask=gone))
+    off = foreseen(model, with_only(scenes, ("goal", "agent")))
+    on = foreseen(model, scenes)
     np.testing.assert_allclose(off[:, :, 2:], absent[:, :, 2:], rtol=1e-4, atol=1e-3)
     assert np.abs(off - on)[:, :, 2:].max() > 1e-2
 
@@ -51,7 +58,7 @@ def test_an_edge_type_switched_off_equals_data_without_its_node(name: str):
 def test_subsets_follow_the_agents(name: str):
     model, scenes = random_model(name), with_only(flock(3, 9), ("obstacle", "agent"))
     order = np.array([0, 1, 4, 2, 3])
-    one, other = predicted_from_start(model, scenes), predicted_from_start(model, permuted(scenes, order))
+    one, other = foreseen(model, scenes), foreseen(model, permuted(scenes, order))
     np.testing.assert_allclose(other, one[:, :, order], rtol=1e-3, atol=1e-2)
 
 
@@ -127,7 +134,8 @@ def test_a_network_that_is_the_law_has_no_error_in_any_column_and_one_with_mixed
         assert max(column.error.published_mean) < 1e-6
         agents = column.truth.kind[0] == AGENT
         truth = np.concatenate([column.truth.position, column.truth.velocity], axis=-1)[:2]
-        np.testing.assert_allclose(column.predicted[:, :, agents], truth[:, :, agents], rtol=1e-3, atol=1e-2)
+        guess = np.concatenate([column.predicted.position, column.predicted.velocity], axis=-1)
+        np.testing.assert_allclose(guess[:, :, agents], truth[:, :, agents], rtol=1e-3, atol=1e-2)
     # The drag of the goal term sits in the node function: right as long as the goal is there.
     names = {name: COLUMNS[name] for name in "ce"}
     mixed = separation(by_hand(own_speed=0.5), scenes, LAW, columns=names, shown=1)
@@ -143,4 +151,4 @@ def test_the_figure_shows_each_subset_with_its_error_and_leaves_out_what_is_not_
     goals = [[line.get_gid() for line in ax.lines].count("goal") for ax in figure.axes]
     assert goals == [1, 0, 1, 0]
     solid = {line.get_gid(): line for line in figure.axes[3].lines}["solid 0"]
-    np.testing.assert_allclose(np.asarray(solid.get_xdata()), columns["f"].predicted[1, :, 2, 0])
+    np.testing.assert_allclose(np.asarray(solid.get_xdata()), columns["f"].predicted.position[1, :, 2, 0])

@@ -2,11 +2,8 @@
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -14,7 +11,8 @@ from matplotlib.figure import Figure
 from envs.storage import load, save
 from envs.trajectories import Trajectories
 from gnn.checkpoint import Model
-from gnn.windows import Dataset, check_rows, windows
+from gnn.forecast import forecast
+from gnn.windows import check_rows
 from swarmnet.figures_thesis import Shown
 from swarmnet.reproduce.experiment import Cell, Experiment
 from swarmnet.sheets import write_sheet
@@ -32,28 +30,9 @@ def show(model: Model, truth: Trajectories, folder: Path, name: str, *, unit: fl
     Raises TrajectoryError when the scenes are too short.
     """
     truth = until(truth, model.config.window + STEPS)
-    guess = predicted(model, truth)
+    guess = forecast(model, truth)
     keep(folder, name, truth, guess)
     return scene_errors(truth, guess, model.config.window) / unit
-
-
-def predicted(model: Model, truth: Trajectories) -> Trajectories:
-    """The first `window` rows of every scene, then predictions from these alone; agents that overflow are absent then.
-
-    `provenance["given"]` is the number of rows that the model was given.
-    """
-    given, rows = model.config.window, truth.position.shape[1]
-    scene, zero = jnp.arange(len(truth)), jnp.zeros(len(truth), jnp.int32)
-    history, _, _, graph = windows(
-        Dataset.of(truth), scene, zero, window=given, horizon=rows - given, counts=truth.counts
-    )
-    run = jax.jit(lambda params, history, graph: model.predict(params, history, graph, horizon=rows - given))
-    states = np.concatenate([history, run(model.params, history, graph)], axis=1)
-    sound = np.logical_and.accumulate(np.isfinite(states).all(axis=-1), axis=1)
-    mask = truth.mask & sound
-    states = np.where(mask[..., None], states, 0).astype(np.float32)
-    about = truth.provenance | {"policy": "prediction", "given": given}
-    return replace(truth, position=states[..., :2], velocity=states[..., 2:], mask=mask, provenance=about)
 
 
 def scene_errors(truth: Trajectories, guess: Trajectories, given: int) -> Float[np.ndarray, " S"]:
