@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from golden import golden_state, relative_error
 from helpers import scene_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +17,7 @@ from envs.config import published
 from envs.dynamics import free_flight, limited
 from envs.experts.boids import boids, rules
 from envs.experts.config import BoidsConfig
-from envs.state import State, make_state
+from envs.state import State
 from swarm_mjcf.errors import SpecError
 from swarm_mjcf.spec import SceneSpec
 from swarmnet.numpy_boids import numpy_boids
@@ -28,15 +29,10 @@ PUBLISHED = BoidsConfig()
 NO_WALLS = BoidsConfig(walls=False)
 
 
-def golden_state(world: str, dtype: type) -> State:
-    fields = {name: GOLDEN[f"{world}/{name}"].astype(dtype) for name in ("position", "velocity", "goal", "obstacle")}
-    return make_state(**jax.tree.map(jnp.asarray, fields))
-
-
 def computed(world: str, dtype: type) -> dict[str, np.ndarray]:
     """All that the published code computed for its states, computed by ours."""
     with jax.enable_x64(dtype == np.float64):
-        return jax.device_get(jax.jit(everything)(golden_state(world, dtype)))
+        return jax.device_get(jax.jit(everything)(golden_state(GOLDEN, world, dtype)))
 
 
 def everything(state: State) -> dict[str, jax.Array]:
@@ -48,11 +44,6 @@ def everything(state: State) -> dict[str, jax.Array]:
     executed = limited(state.velocity, ours["acceleration"], scene)
     after = free_flight(state.position, state.velocity, executed, scene)
     return ours | dict(zip(("next_position_dt0.3", "next_velocity_dt0.3"), after, strict=True))
-
-
-def relative_error(ours: np.ndarray, golden: np.ndarray) -> np.ndarray:
-    """Error of each agent's vector relative to max(|golden|, 1)."""
-    return np.linalg.norm(ours - golden, axis=-1) / np.maximum(np.linalg.norm(golden, axis=-1), 1)
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -97,7 +88,7 @@ def test_the_golden_states_put_every_rule_to_the_test():
 @pytest.mark.parametrize("rule", RULES)
 def test_a_rule_alone_is_its_weight_times_the_rule(rule: str):
     weights = dict.fromkeys(RULES, 0.0) | {rule: 3.0}
-    state = golden_state("boid_n10_k3", np.float32)
+    state = golden_state(GOLDEN, "boid_n10_k3", np.float32)
     alone = boids(BoidsConfig(**weights))(state)
     np.testing.assert_allclose(alone, 3 * rules(PUBLISHED)[rule](state), rtol=1e-6)
     assert np.abs(alone).max() > 0.1

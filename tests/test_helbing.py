@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from golden import golden_state, relative_error
 from helpers import scene_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,11 +30,6 @@ PUBLISHED = HelbingConfig()
 FIVE = SceneSpec(num_agents=5, num_obstacles=2)
 
 
-def golden_state(world: str, dtype: type) -> State:
-    fields = {name: GOLDEN[f"{world}/{name}"].astype(dtype) for name in ("position", "velocity", "goal", "obstacle")}
-    return make_state(**jax.tree.map(jnp.asarray, fields))
-
-
 def computed(world: str, dtype: type) -> dict[str, np.ndarray]:
     """All that the published code computed for its states, computed by ours."""
 
@@ -48,12 +44,7 @@ def computed(world: str, dtype: type) -> dict[str, np.ndarray]:
         }
 
     with jax.enable_x64(dtype == np.float64):
-        return jax.device_get(jax.jit(everything)(golden_state(world, dtype)))
-
-
-def relative_error(ours: np.ndarray, golden: np.ndarray) -> np.ndarray:
-    """Error of each agent's vector relative to max(|golden|, 1)."""
-    return np.linalg.norm(ours - golden, axis=-1) / np.maximum(np.linalg.norm(golden, axis=-1), 1)
+        return jax.device_get(jax.jit(everything)(golden_state(GOLDEN, world, dtype)))
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -109,7 +100,7 @@ def numpy_terms(state: State, config: HelbingConfig) -> dict[str, np.ndarray]:
 
 
 def test_each_term_alone_and_weighted():
-    state = golden_state("helbing_n5_k1_dense", np.float32)
+    state = golden_state(GOLDEN, "helbing_n5_k1_dense", np.float32)
     state = jax.tree.map(lambda x: x[:10], state)
     expected, unweighted = numpy_terms(state, PUBLISHED), terms(state)
     for name in TERMS:
@@ -129,7 +120,7 @@ def test_two_agents_by_hand():
 
 
 def test_agents_and_obstacles_can_be_switched_off():
-    state = golden_state("helbing_n10_k2", np.float32)
+    state = golden_state(GOLDEN, "helbing_n10_k2", np.float32)
     both, agents, obstacles = (
         np.asarray(law_of(replace(PUBLISHED, goal=0.0, agents=a, obstacles=o))(state))
         for a, o in ((True, True), (True, False), (False, True))
