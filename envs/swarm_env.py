@@ -1,7 +1,7 @@
 """The environment: `reset(keys)`, `step(state, acceleration)`. Holds constants only; all that changes is in `State`."""
 
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -52,8 +52,10 @@ def _outrun(state: State, spec: SceneSpec) -> Bool[Array, " S"]:
     return (~within & state.obstacle_present).any(axis=1)
 
 
-_spawn = jax.jit(spawn, static_argnums=(1, 2))
-"""Compiled once for all environments of equal scenes."""
+@lru_cache(maxsize=16)
+def _compiled_spawn(spec: SceneSpec, config: SpawnConfig):
+    """Shared by all environments of equal scenes; the latest are kept, as programs take room in a process."""
+    return jax.jit(partial(spawn, spec=spec, config=config))
 
 
 class SwarmEnv:
@@ -90,7 +92,7 @@ class SwarmEnv:
 
     def reset(self, keys: Key[Array, " S"]) -> State:
         """Starting states. Raises SpawnError when a scene has no room; inside `jit` use `spawn`."""
-        state, ok = _spawn(keys, self.spec, self.spawn_config)
+        state, ok = _compiled_spawn(self.spec, self.spawn_config)(keys)
         failed = int(np.sum(~np.asarray(ok)))
         if failed:
             raise too_dense(self.spec, self.spawn_config, failed, len(ok))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +88,7 @@ def prediction_error(
     # Every start that fits the shortest horizon; what lies beyond the end of a trajectory is masked.
     starts = rows - window - horizons[0] + 1
     padded = longest + starts - 1 + window - rows
+    run = _compiled(predict, window, longest, counts, starts)
     first_agent = counts[0] + counts[1]
     sums, moved = [], np.zeros((3, longest))
     for first in range(0, len(trajectories), scenes_per_batch):
@@ -98,8 +99,7 @@ def prediction_error(
             mask=np.pad(batch.mask, ((0, 0), (0, padded), (0, 0))),
             edges=batch.edges,
         )
-        found = _batch_errors(predict, params, batch, window=window, horizon=longest, counts=counts, starts=starts)
-        square, count, displaced = (np.asarray(x, np.float64) for x in found)
+        square, count, displaced = (np.asarray(x, np.float64) for x in run(params, batch))
         real = min(scenes_per_batch, len(trajectories) - first)
         sums.append((square[: real * starts], count[: real * starts]))
         moved += displaced[: real * starts].sum(axis=0)
@@ -149,7 +149,12 @@ def _mean(square: np.ndarray, count: np.ndarray) -> np.ndarray:
     return np.divide(square.sum(axis=(1, 2)), 4 * total, out=np.full(len(total), np.nan), where=total > 0)
 
 
-@partial(jax.jit, static_argnames=("predict", "window", "horizon", "counts", "starts"))
+@lru_cache(maxsize=16)
+def _compiled(predict: Predict, window: int, horizon: int, counts: tuple[int, int, int], starts: int):
+    """`_batch_errors` of a predictor, for all data of one shape."""
+    return jax.jit(partial(_batch_errors, predict, window=window, horizon=horizon, counts=counts, starts=starts))
+
+
 def _batch_errors(
     predict: Predict,
     params: Params,

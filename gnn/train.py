@@ -8,14 +8,15 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Key
+from jaxtyping import Float, Key
 
 from envs.plain import plain
 from envs.record import Array
@@ -107,7 +108,7 @@ class Prepared:
     start: Callable[[], dict]
     """The state before the first step: weights, optimizer, step."""
     run_chunk: Callable[..., tuple[dict, Array, Array]]
-    """`(state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`, see `run_chunk`."""
+    """`(state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`, see `Compiled`."""
     measure: Callable[[Params], Array]
     """The validation error of weights."""
 
@@ -167,7 +168,7 @@ def prepare(
         },
         data=data,
         start=start,
-        run_chunk=partial(run_chunk, recipe, scales, config.seed),
+        run_chunk=partial(compiled(recipe).run_chunk, scales, config.seed),
         measure=_make_validation(recipe, scales, validation or trajectories, furthest),
     )
 
@@ -252,69 +253,81 @@ def _check_weights(params: Params, shapes: Params) -> None:
         raise SpecError("initial", ", ".join(different), "weights for the same kinds of nodes as in the data")
 
 
+class Compiled(NamedTuple):
+    """The functions of a training, compiled for each shape of what they take."""
+
+    initial: Callable[..., Params]
+    """`(scales, seed, history, graph) -> weights`."""
+    run_chunk: Callable[..., tuple[dict, Array, Array]]
+    """`(scales, seed, state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`: `config.chunk`
+    gradient steps."""
+    error: Callable[..., Array]
+    """`(scales, params, history, truth, mask, graph) -> mean squared error` of agents' states."""
+
+
+@lru_cache(maxsize=8)
+def compiled(recipe: Recipe) -> Compiled:
+    """One compile for a horizon, whatever the seed, the scales and the number of steps.
+
+    The latest recipes are kept: a process has room for some thousands of programs, and no more.
+    """
+    config, counts, window = recipe.config, recipe.counts, recipe.preset.window
+
+    def initial(scales: Scales, seed: int | Array, history: Array, graph: Graph) -> Params:
+        return recipe.family(scales).init(jax.random.key(seed), history, graph)
+
+    def run_chunk(scales: Scales, seed: int | Array, state: dict, data: Dataset, steps: int | Array, *, horizon: int):
+        family = recipe.family(scales)
+        optimizer, frozen_leaves = recipe.optimizer(state["params"]), frozen(state["params"], recipe.freeze)
+        noise_unit = config.noise * jnp.stack(
+            [scales.position_change, scales.position_change, scales.velocity_change, scales.velocity_change]
+        )
+
+        def loss_of(params: dict, key: Key[Array, ""]) -> Array:
+            k_scene, k_start, k_noise, k_model = jax.random.split(key, 4)
+            scenes, rows = data.states.shape[:2]
+            scene = jax.random.randint(k_scene, (config.batch,), 0, scenes)
+            start = jax.random.randint(k_start, (config.batch,), 0, rows - window - horizon + 1)
+            history, truth, mask, graph = windows(data, scene, start, window=window, horizon=horizon, counts=counts)
+            if config.noise:
+                moving = graph.present & (jnp.arange(sum(counts)) >= counts[0] + counts[1])
+                noise = noise_unit * jax.random.normal(k_noise, history.shape)
+                history = history + jnp.where(moving[:, None, :, None], noise, 0)
+            return family.loss(params, history, truth, mask, graph, k_model)
+
+        def one(state: dict, _: None):
+            step, raw = state["step"], state["raw" if config.average else "params"]
+            key = jax.random.fold_in(jax.random.key(seed + 1), step)
+            loss, gradient = jax.value_and_grad(loss_of)(raw, key)
+            updates, opt_state = optimizer.update(gradient, state["optimizer"], raw)
+            rate = 0.5 * config.learning_rate * (1 + jnp.cos(jnp.pi * step / steps))
+            raw = optax.apply_updates(raw, jax.tree.map(lambda update: -rate * update, updates))
+            new = {"params": raw, "optimizer": opt_state, "step": step + 1}
+            if config.average:
+                # The first steps leave the initial weights behind: the mean begins short and grows.
+                keep = jnp.minimum(config.average, (1 + step) / (10 + step))
+                new["params"] = jax.tree.map(lambda mean, now: mean + (1 - keep) * (now - mean), state["params"], raw)
+                new["raw"] = raw
+            return new, (loss, optax.tree.norm(free_leaves(gradient, frozen_leaves)))
+
+        state, (loss, norm) = jax.lax.scan(one, state, None, length=config.chunk)
+        return state, loss.mean(), norm.mean()
+
+    def error(
+        scales: Scales, params: Params, history: Array, truth: Array, mask: Array, graph: Graph
+    ) -> Float[Array, ""]:
+        predicted = recipe.family(scales).predict(params, history, graph, horizon=truth.shape[1])
+        mask = mask & (jnp.arange(mask.shape[-1]) >= sum(graph.counts[:2]))
+        square = jnp.mean((predicted - truth) ** 2, axis=-1)
+        return jnp.sum(jnp.where(mask, square, 0)) / jnp.maximum(mask.sum(), 1)
+
+    return Compiled(jax.jit(initial), jax.jit(run_chunk, static_argnames="horizon"), jax.jit(error))
+
+
 def _first_weights(recipe: Recipe, scales: Scales, seed: int, data: Dataset) -> Params:
     zero = jnp.zeros(1, jnp.int32)
     history, _, _, graph = windows(data, zero, zero, window=recipe.preset.window, horizon=1, counts=recipe.counts)
-    return _initial(recipe, scales, seed, history, graph)
-
-
-@partial(jax.jit, static_argnums=0)
-def _initial(recipe: Recipe, scales: Scales, seed: int | Array, history: Array, graph: Graph) -> Params:
-    return recipe.family(scales).init(jax.random.key(seed), history, graph)
-
-
-@partial(jax.jit, static_argnums=0, static_argnames="horizon")
-def run_chunk(
-    recipe: Recipe,
-    scales: Scales,
-    seed: int | Array,
-    state: dict,
-    data: Dataset,
-    steps: int | Array,
-    *,
-    horizon: int,
-) -> tuple[dict, Array, Array]:
-    """`config.chunk` gradient steps of `steps` in all: the state after them, mean loss and mean gradient norm.
-
-    One compile for a horizon, whatever the seed, the scales and the number of steps.
-    """
-    config, preset, counts = recipe.config, recipe.preset, recipe.counts
-    family, window = recipe.family(scales), preset.window
-    noise_unit = config.noise * jnp.stack(
-        [scales.position_change, scales.position_change, scales.velocity_change, scales.velocity_change]
-    )
-
-    def loss_of(params: dict, key: Key[Array, ""]) -> Array:
-        k_scene, k_start, k_noise, k_model = jax.random.split(key, 4)
-        scenes, rows = data.states.shape[:2]
-        scene = jax.random.randint(k_scene, (config.batch,), 0, scenes)
-        start = jax.random.randint(k_start, (config.batch,), 0, rows - window - horizon + 1)
-        history, truth, mask, graph = windows(data, scene, start, window=window, horizon=horizon, counts=counts)
-        if config.noise:
-            moving = graph.present & (jnp.arange(sum(counts)) >= counts[0] + counts[1])
-            noise = noise_unit * jax.random.normal(k_noise, history.shape)
-            history = history + jnp.where(moving[:, None, :, None], noise, 0)
-        return family.loss(params, history, truth, mask, graph, k_model)
-
-    optimizer, mask = recipe.optimizer(state["params"]), frozen(state["params"], recipe.freeze)
-
-    def one(state: dict, _: None):
-        step, raw = state["step"], state["raw" if config.average else "params"]
-        key = jax.random.fold_in(jax.random.key(seed + 1), step)
-        loss, gradient = jax.value_and_grad(loss_of)(raw, key)
-        updates, opt_state = optimizer.update(gradient, state["optimizer"], raw)
-        rate = 0.5 * config.learning_rate * (1 + jnp.cos(jnp.pi * step / steps))
-        raw = optax.apply_updates(raw, jax.tree.map(lambda update: -rate * update, updates))
-        new = {"params": raw, "optimizer": opt_state, "step": step + 1}
-        if config.average:
-            # The first steps leave the initial weights behind: the mean begins short and grows.
-            keep = jnp.minimum(config.average, (1 + step) / (10 + step))
-            new["params"] = jax.tree.map(lambda mean, now: mean + (1 - keep) * (now - mean), state["params"], raw)
-            new["raw"] = raw
-        return new, (loss, optax.tree.norm(free_leaves(gradient, mask)))
-
-    state, (loss, norm) = jax.lax.scan(one, state, None, length=config.chunk)
-    return state, loss.mean(), norm.mean()
+    return compiled(recipe).initial(scales, seed, history, graph)
 
 
 def _make_validation(recipe: Recipe, scales: Scales, trajectories: Trajectories, horizon: int):
@@ -324,17 +337,5 @@ def _make_validation(recipe: Recipe, scales: Scales, trajectories: Trajectories,
     scene = jnp.asarray(rng.integers(0, len(trajectories), VALIDATION_WINDOWS))
     start = jnp.asarray(rng.integers(0, trajectories.position.shape[1] - window - horizon + 1, VALIDATION_WINDOWS))
     history, truth, mask, graph = windows(data, scene, start, window=window, horizon=horizon, counts=counts)
-    unit = natural_change(trajectories)[1]
-    return lambda params: _validation_error(recipe, scales, params, history, truth, mask, graph) / unit
-
-
-@partial(jax.jit, static_argnums=0)
-def _validation_error(
-    recipe: Recipe, scales: Scales, params: Params, history: Array, truth: Array, mask: Array, graph: Graph
-) -> Array:
-    """Mean squared error of agents' states."""
-    goals, obstacles, _ = graph.counts
-    predicted = recipe.family(scales).predict(params, history, graph, horizon=truth.shape[1])
-    mask = mask & (jnp.arange(mask.shape[-1]) >= goals + obstacles)
-    square = jnp.mean((predicted - truth) ** 2, axis=-1)
-    return jnp.sum(jnp.where(mask, square, 0)) / jnp.maximum(mask.sum(), 1)
+    unit, error = natural_change(trajectories)[1], compiled(recipe).error
+    return lambda params: error(scales, params, history, truth, mask, graph) / unit

@@ -12,7 +12,7 @@ import gnn.budget
 from gnn.budget import Pace, fitted, measured, train_for
 from gnn.checkpoint import CheckpointError
 from gnn.config import TrainConfig
-from gnn.train import prepare, run_chunk, train
+from gnn.train import prepare, train
 from gnn.windows import Dataset
 from swarm_mjcf.errors import SpecError
 
@@ -107,6 +107,6 @@ def test_the_functions_do_not_depend_on_the_number_of_steps(tmp_path: Path):
     prepared = prepare(replace(CONFIG, horizons=(1,), stage_steps=(4,)), spring())
     state = prepared.start()
     prepared.run_chunk(state, prepared.data, 4, horizon=1)
-    compiled = run_chunk._cache_size()
+    compiled = prepared.run_chunk.func._cache_size()
     prepared.run_chunk(state, prepared.data, 400, horizon=1)
-    assert run_chunk._cache_size() == compiled
+    assert prepared.run_chunk.func._cache_size() == compiled
