@@ -256,6 +256,19 @@ def test_certify_writes_both_files(copy: Path, capsys):
     assert again == document
 
 
+def test_counter_examples_of_a_certificate_go_back_into_a_repair(given: Path, repaired: Path, tmp_path: Path, capsys):
+    wrong, again = Path(shutil.copytree(given, tmp_path / "wrong")), tmp_path / "again"
+    main(("certify", str(wrong), "--distance", "4", "--goal", "20", "0", "--cells", "300", "--examples", "20"))
+    file = wrong / "counter-examples.npz"
+    assert len(unpacked(file)) > 0
+    asked = ("repair", str(given), "--run", str(again), *SMALL, "--examples", str(file))
+    assert main(asked) == 0
+    rows, without = (json.loads((run / "repair.json").read_text()) for run in (again, repaired))
+    assert rows["verification"]["rows"] > without["verification"]["rows"]
+    file.write_text("damaged")
+    assert "holds no counter-examples" in fails(capsys, *asked)
+
+
 # --- the filter ---
 
 PUSH = """
