@@ -1,6 +1,7 @@
 """Settings that must stand before any test module imports JAX, and Hypothesis's profile."""
 
 import gc
+import importlib
 import os
 import sys
 from pathlib import Path
@@ -12,6 +13,15 @@ os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 from hypothesis import settings
+
+# jaxtyping's hook has whatever is imported on the way of an instrumented module compiled from source, 2000 modules of
+# libraries in each worker: what is here before has its bytecode.
+for library in (
+    "beartype.door", "cvxpy", "flax.linen", "h5py", "jax.experimental.shard_map", "matplotlib.backends.backend_agg",
+    "matplotlib.figure", "mujoco.mjx", "optax", "orbax.checkpoint", "PIL.Image", "pyarrow.parquet", "pyscipopt",
+    "rich.progress", "scipy.io", "scipy.optimize", "scipy.spatial", "scipy.stats", "tensorboardX", "tyro",
+):  # fmt: skip
+    importlib.import_module(library)
 
 # Tests share `helpers.py`; with import mode importlib their folder is not on the path by itself.
 sys.path.insert(0, str(Path(__file__).parent))

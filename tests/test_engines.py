@@ -117,7 +117,7 @@ def test_both_engines_agree_on_every_flag_and_body_of_a_single_step():
         np.testing.assert_allclose(getattr(here, name), getattr(there, name), atol=2e-4, err_msg=name)
 
 
-@pytest.mark.parametrize("k", [1, 2, 15, 30])
+@pytest.mark.parametrize("k", [1, 2, 30])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_free_flight_is_the_closed_form(engine: str, k: int):
     spec = SceneSpec(num_agents=2, num_obstacles=0, substeps=k, contacts=False)
