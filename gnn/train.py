@@ -144,7 +144,7 @@ def prepare(
     )
     data = Dataset.of(trajectories)
     recipe = Recipe(Recipe.without_numbers(config), preset, integrator, trajectories.counts, tuple(freeze))
-    first = partial(_first_weights, recipe, scales, config.seed, data)
+    first = partial(_first_weights, recipe, scales, jax.random.key(config.seed), data)
     shapes = jax.eval_shape(first)
     if initial is not None:
         _check_weights(initial.params, shapes)
@@ -168,7 +168,7 @@ def prepare(
         },
         data=data,
         start=start,
-        run_chunk=partial(compiled(recipe).run_chunk, scales, config.seed),
+        run_chunk=partial(compiled(recipe).run_chunk, scales, jax.random.key(config.seed + 1)),
         measure=_make_validation(recipe, scales, validation or trajectories, furthest),
     )
 
@@ -257,9 +257,9 @@ class Compiled(NamedTuple):
     """The functions of a training, compiled for each shape of what they take."""
 
     initial: Callable[..., Params]
-    """`(scales, seed, history, graph) -> weights`."""
+    """`(scales, key, history, graph) -> weights`."""
     run_chunk: Callable[..., tuple[dict, Array, Array]]
-    """`(scales, seed, state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`: `config.chunk`
+    """`(scales, key, state, data, steps in all, horizon=) -> (state, mean loss, mean gradient norm)`: `config.chunk`
     gradient steps."""
     error: Callable[..., Array]
     """`(scales, params, history, truth, mask, graph) -> mean squared error` of agents' states."""
@@ -273,10 +273,12 @@ def compiled(recipe: Recipe) -> Compiled:
     """
     config, counts, window = recipe.config, recipe.counts, recipe.preset.window
 
-    def initial(scales: Scales, seed: int | Array, history: Array, graph: Graph) -> Params:
-        return recipe.family(scales).init(jax.random.key(seed), history, graph)
+    def initial(scales: Scales, key: jax.Array, history: Array, graph: Graph) -> Params:
+        return recipe.family(scales).init(key, history, graph)
 
-    def run_chunk(scales: Scales, seed: int | Array, state: dict, data: Dataset, steps: int | Array, *, horizon: int):
+    def run_chunk(
+        scales: Scales, root: Key[Array, ""], state: dict, data: Dataset, steps: int | Array, *, horizon: int
+    ) -> tuple[dict, Array, Array]:
         family = recipe.family(scales)
         optimizer, frozen_leaves = recipe.optimizer(state["params"]), frozen(state["params"], recipe.freeze)
         noise_unit = config.noise * jnp.stack(
@@ -297,7 +299,7 @@ def compiled(recipe: Recipe) -> Compiled:
 
         def one(state: dict, _: None):
             step, raw = state["step"], state["raw" if config.average else "params"]
-            key = jax.random.fold_in(jax.random.key(seed + 1), step)
+            key = jax.random.fold_in(root, step)
             loss, gradient = jax.value_and_grad(loss_of)(raw, key)
             updates, opt_state = optimizer.update(gradient, state["optimizer"], raw)
             rate = 0.5 * config.learning_rate * (1 + jnp.cos(jnp.pi * step / steps))
@@ -324,10 +326,10 @@ def compiled(recipe: Recipe) -> Compiled:
     return Compiled(jax.jit(initial), jax.jit(run_chunk, static_argnames="horizon"), jax.jit(error))
 
 
-def _first_weights(recipe: Recipe, scales: Scales, seed: int, data: Dataset) -> Params:
+def _first_weights(recipe: Recipe, scales: Scales, key: jax.Array, data: Dataset) -> Params:
     zero = jnp.zeros(1, jnp.int32)
     history, _, _, graph = windows(data, zero, zero, window=recipe.preset.window, horizon=1, counts=recipe.counts)
-    return compiled(recipe).initial(scales, seed, history, graph)
+    return compiled(recipe).initial(scales, key, history, graph)
 
 
 def _make_validation(recipe: Recipe, scales: Scales, trajectories: Trajectories, horizon: int):

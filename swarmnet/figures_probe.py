@@ -115,7 +115,7 @@ def separation_figure(columns: dict[str, Column], scenes: tuple[int, ...] = (0, 
         for name, column in columns.items():
             truth = _felt(column.truth.take([scene]), column.kinds)
             guess = column.predicted.take([scene])
-            solid.append(replace(truth, position=guess.position, velocity=guess.velocity))
+            solid.append(replace(truth, position=guess.position, velocity=guess.velocity, mask=truth.mask & guess.mask))
             dashed.append(truth)
             error = dict(zip(column.error.horizons, column.error.published_mean, strict=True))
             figures = " / ".join(f"{error[h]:.2g}" for h in HORIZONS if h in error)

@@ -126,7 +126,7 @@ def render_page(folder: str | Path) -> str:
         "",
         "Rendered from `docs/results/*.json` by `make docs`; every file was written by the command it names.",
     ]
-    for path in sorted(Path(folder).glob("*.json")):
+    for path in sorted(Path(folder).glob("[!.]*.json")):
         document = json.loads(path.read_text())
         machine, used = document["hardware"], document["versions"]
         columns = list(dict.fromkeys(row["column"] for row in document["rows"]))

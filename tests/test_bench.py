@@ -26,7 +26,6 @@ def test_throughput_counts_real_contacts_and_names_what_it_ran():
     assert [(row.engine, row.scenes, row.substeps) for row in rows] == [("native", 4, 1), ("native", 8, 1)]
     for row in rows:
         assert 0 < row.contact_states < row.scenes * EPISODE * 2 * AGENTS
-        assert row.saturated == 0
         assert row.control_steps_per_second > 0
         assert row.compile_seconds > 0
 

@@ -182,7 +182,7 @@ def test_figures_of_what_is_there(tmp_path) -> None:
     assert "dt = 0.5 s" in sweep.caption
     for path in (sweep.path, sweep.narrow, learning.path):
         assert path.read_text().rstrip().endswith("</svg>")
-    assert not list((run / "figures").glob("*.partial"))
+    assert not list((run / "figures").glob("*.partial*"))
 
 
 def test_an_unreadable_evaluation_is_named(tmp_path) -> None:

@@ -338,4 +338,4 @@ def test_a_run_of_a_sibling_is_copied_and_only_the_same_one(tmp_path, short) -> 
     )
     assert learn("tuned too", mean, part="tuned", **tuning)[1] == of_tuning
     assert learn("all free", mean, initial=first)[1] not in (metrics, of_tuning)
-    assert not list((tmp_path / "out").rglob("*.partial"))
+    assert not list((tmp_path / "out").rglob("*.partial*"))

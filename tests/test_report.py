@@ -137,7 +137,7 @@ def test_a_whole_run(tmp_path) -> None:
         for key in ("src", "href", "srcset", "poster"):
             assert attributes.get(key, "data:").startswith("data:")
     assert "http" not in (Path(__file__).parent.parent / "swarmnet" / "report.css").read_text()
-    assert not list(run.glob("*.partial"))
+    assert not list(run.glob("*.partial*"))
 
 
 def test_a_prediction_of_recordings(tmp_path) -> None:

@@ -398,6 +398,14 @@ def test_a_helper_ends_with_a_command_that_is_killed(tmp_path: Path):
         assert ended(number, seconds=30)
 
 
+def test_a_helper_that_is_done_ends_while_the_command_goes_on():
+    words = [sys.executable, "-c", "from swarmnet.reproduce.helper import end_with_parent; end_with_parent()"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()) as done:
+        assert done.wait(timeout=60) == 0
+        assert done.stderr is not None
+        assert not done.stderr.read()
+
+
 def ended(process: int, *, seconds: float) -> bool:
     """Whether a process that is nobody's child here ends in time."""
     until = time.monotonic() + seconds

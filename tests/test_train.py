@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from learning import quick_training, spring, tiny
 
+import gnn.train
 from envs.trajectories import TrajectoryError
 from gnn.checkpoint import CheckpointError, Checkpoints, load_model
 from gnn.config import TrainConfig
@@ -80,6 +81,9 @@ def test_horizons_come_in_the_order_of_the_curriculum_with_one_compile_each(tmp_
     assert prepare(other, spring(seed=3)).run_chunk.func is run_chunk
     assert run_chunk._cache_size() == 2
     assert not np.array_equal(again.scales.position, model.scales.position)
+    gnn.train.compiled.cache_clear()  # alone, it gives the same
+    alone = train(other, spring(seed=3), tmp_path / "alone")
+    jax.tree.map(np.testing.assert_array_equal, alone.params, again.params)
     assert [(done, total) for done, total, _ in seen] == [(2, 10), (4, 10), (6, 10), (8, 10), (10, 10)]
     rows = read_metrics(tmp_path / "one" / "metrics.jsonl")
     assert [(row["step"], row["stage"], row["horizon"]) for row in rows] == [

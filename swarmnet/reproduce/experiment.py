@@ -125,6 +125,8 @@ class Experiment:
     """Rows that learn nothing: one cell for each data set, whatever the seeds, and no share of the minutes."""
     exists: Callable[[str, str], bool] = _everywhere
     """Whether a (row, data set) makes sense; by default every one."""
+    in_quick: Callable[[str, str], bool] = _everywhere
+    """Whether profile quick does it: what it leaves out has no share of its minutes."""
     unit: str = "normalized MSE"
     notes: str = ""
     """What a reader must know, printed below the table."""
@@ -172,7 +174,8 @@ class Experiment:
         if profile not in PROFILES:
             raise SpecError("profile", profile, "one of " + ", ".join(PROFILES))
         chosen = PROFILES[profile]
-        shares = sum(cell.row not in self.untrained for cell in self.cells(chosen.seeds))
+        cells = self.cells(chosen.seeds)
+        shares = sum(cell.row not in self.untrained and self.in_quick(cell.row, cell.data) for cell in cells)
         return Effort(
             profile=profile,
             demonstrations=chosen.demonstrations,

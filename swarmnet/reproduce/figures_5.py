@@ -232,9 +232,8 @@ def learned(policies: Policies, row: str) -> dict[str, float]:
 
 
 def run_5_2(cell: Cell, effort: Effort, folder: Path, progress: Update) -> dict[str, float]:
-    """Trains the row's policy and judges it on unseen scenes; in profile quick nothing but from 1k
-    demonstrations, and no rows beside the modes."""
-    if effort.profile == "quick" and (cell.data != FEW or cell.row in TERMINATIONS):
+    """Trains the row's policy and judges it on unseen scenes."""
+    if effort.profile == "quick" and not FIGURE_5_2.in_quick(cell.row, cell.data):
         return {}
     policies = policies_of(cell, cell.data, effort, folder, progress)
     found = policies.judged(cell.row, replace(WORLD, scenes=TESTED * effort.test_scenes), folder)
@@ -365,6 +364,7 @@ FIGURE_5_2 = Experiment(
     leading=(IMITATED, SCRATCH),
     untrained=(EXPERT,),
     exists=lambda row, data: data == FEW or row not in (EXPERT, SCRATCH, *TERMINATIONS),
+    in_quick=lambda row, data: data == FEW and row not in TERMINATIONS,
     unit="as named",
     notes="`1k`, `10k`: demonstrations of the imitation policy; `1k longer`: "
     f"{IMITATION[LONGER][1].stage_steps[0]} gradient steps from them instead of {IMITATION[FEW][1].stage_steps[0]}. "

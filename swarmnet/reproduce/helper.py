@@ -12,7 +12,8 @@ def end_with_parent() -> None:
     """Ends this process when its standard input closes: the other end is held by the process that started it."""
 
     def wait() -> None:
-        sys.stdin.buffer.read()
+        while os.read(0, 1):  # not sys.stdin, whose lock would be held when this process ends first
+            pass
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=wait, daemon=True).start()
