@@ -69,6 +69,7 @@ class Residuals:
     """Of the model's own samples along and across the heading [m^2/s^4]; 0 for one that does not draw."""
 
 
+@jax.jit
 def spread(noise: ProcessNoise, last: Float[Array, "B V 4"], graph: Graph) -> Float[Array, "B N 2"]:
     """Standard deviations along and across the heading [m/s^2]; 0 for absent agents."""
     unit = noise.scales.acceleration

@@ -13,6 +13,8 @@ os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
 # Compiling is two thirds of the suite's time, and tests compile much and run little; 0 tests what users run, slowly.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
+import jax
+import pytest
 from hypothesis import settings
 
 # jaxtyping's hook has whatever is imported on the way of an instrumented module compiled from source, 2000 modules of
@@ -37,3 +39,13 @@ def pytest_collection_finish() -> None:
     """What imports and collection made stays to the end: the garbage collector need not look at it again and again."""
     gc.collect()
     gc.freeze()
+
+
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Between modules, lets go of compiled programs before they fill a process: every one takes a few of the 65,530
+    mappings that Linux gives it, and XLA does not survive their end."""
+    mappings = Path("/proc/self/maps")
+    if nextitem is not None and nextitem.path != item.path and mappings.exists():
+        with mappings.open() as lines:
+            if sum(1 for _ in lines) > 30_000:
+                jax.clear_caches()

@@ -151,7 +151,7 @@ def test_prediction_and_physics_agree_in_free_flight(name: str):
     policy = make_policy(config, COARSE)
     env = SwarmEnv(spec, engine="native", horizon=5)
     step = jax.jit(lambda state: env.step(state, policy(state, params)))
-    wanted = np.asarray(policy(start, params))
+    wanted = np.asarray(jax.jit(policy)(start, params))
     executed = np.asarray(limited(start.velocity, jnp.asarray(wanted), spec))
     assert (np.abs(wanted - executed).max() > 1) == (name == "best"), "the limits must bite, where there are any"
     integrator = Integrator(spec.dt, spec.substeps, spec.max_speed, spec.max_acceleration)

@@ -181,7 +181,7 @@ def test_the_first_gradient_is_the_policy_gradient_whatever_the_clip():
     """At the policy that acted the ratio is 1: the gradient is that of mean(advantage * log probability)."""
     actor, params, _, samples = samples_of()
     config = PPOConfig(**{**vars(FAST), "value_weight": 0.0})
-    found = jax.grad(lambda p: terms_of(actor, p, samples, config)[0])(params)
+    found = jax.jit(jax.grad(lambda p: terms_of(actor, p, samples, config)[0]))(params)
 
     def plain(params):
         mean, _ = actor.apply(params, samples.observation)
@@ -190,7 +190,7 @@ def test_the_first_gradient_is_the_policy_gradient_whatever_the_clip():
         gain = advantage * log_probability(mean, params["log_std"], samples.action)
         return -jnp.where(samples.counts, gain, 0).sum() / samples.counts.sum()
 
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, jax.grad(plain)(params))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, jax.jit(jax.grad(plain))(params))
 
 
 def test_clipped_ratios_have_no_gradient():

@@ -163,8 +163,8 @@ def test_a_process_killed_at_random_moments_ends_with_the_same_weights(tmp_path:
     assert process.returncode == 0, output
     moments = random.Random(0)
     deaths = 0
-    for attempt in range(4):
-        if attempt < 3:  # by itself, somewhere within its second or third save
+    for attempt in range(3):
+        if attempt < 2:  # by itself, somewhere within its second or third save
             process = worker(killed, cache, die_in_save=moments.randint(2, 3), share=moments.random())
         else:  # by us, a moment after it got on
             process, before = worker(killed, cache), newest(killed)
@@ -175,7 +175,7 @@ def test_a_process_killed_at_random_moments_ends_with_the_same_weights(tmp_path:
         output, _ = process.communicate()
         assert process.returncode in (0, -signal.SIGKILL), output
         deaths += process.returncode != 0
-    assert deaths >= 3
+    assert deaths >= 2
     assert newest(killed) > 0
     output, _ = (process := worker(killed, cache)).communicate()
     assert process.returncode == 0, output

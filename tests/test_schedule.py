@@ -118,21 +118,21 @@ def test_later_stages_tune_on_the_mix_with_the_edge_functions_locked(tmp_path: P
 
 def test_the_command_simulates_trains_tests_and_prints(tmp_path: Path, capsys):
     config = Schedule(
-        schedule="2->3", run=tmp_path / "run", scenes=6, steps_per_scene=42, test_scenes=2, test_sizes=(3, 4),
+        schedule="2->3", run=tmp_path / "run", scenes=6, steps_per_scene=42, test_scenes=2, test_sizes=(2, 3),
         validation=0.2, engine="native", json=tmp_path / "schedule.json",
         **{name: getattr(CONFIG, name) for name in ("model", "horizons", "stage_steps", "chunk", "batch")},
     )  # fmt: skip
     assert command.run(config) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split() == ["schedule", "steps", "3", "4"]
+    assert lines[1].split() == ["schedule", "steps", "2", "3"]
     assert [line.split()[:2] for line in lines[2:]] == [["2", "5"], ["2", "40"], ["2->3", "5"], ["2->3", "40"]]
     rows = json.loads((tmp_path / "schedule.json").read_text())["rows"]
     assert [(row["row"], row["column"]) for row in rows[:4]] == [
-        ("2", "N=3 5 steps"), ("2", "N=3 40 steps"), ("2", "N=4 5 steps"), ("2", "N=4 40 steps"),
+        ("2", "N=2 5 steps"), ("2", "N=2 40 steps"), ("2", "N=3 5 steps"), ("2", "N=3 40 steps"),
     ]  # fmt: skip
     assert all(row["value"] > 0 and row["reference"] is None for row in rows)
     assert sorted(path.name for path in (tmp_path / "run" / "data").iterdir()) == [
-        "test-3.h5", "test-4.h5", "train-2.h5", "train-3.h5",
+        "test-2.h5", "test-3.h5", "train-2.h5", "train-3.h5",
     ]  # fmt: skip
 
 
