@@ -307,11 +307,12 @@ class Reproduce:
 
     Without a name, lists them. A table is made of cells (row x data set x seed), each a job of its own that goes on
     where it was interrupted; the same command in two terminals shares them. Finished cells are merged into one JSON
-    that names the missing ones.
+    that names the missing ones, and that another machine can go on from.
 
     Example:
       swarmnet reproduce table-3.1 --profile quick
       swarmnet reproduce table-3.1 --profile cpu --rows "swarmnet best" --columns boids "boids dt0.1" --seeds 0
+      swarmnet reproduce figure-3.7 --profile cpu --minutes 2 --known docs/results/figure-3.7.json
     """
 
     name: str | None = None
@@ -330,6 +331,9 @@ class Reproduce:
     jobs: int | None = None
     """Processes that share the cells; 1 by default, but 2 in profile quick. More train less in the same minutes where
     they have no cores of their own."""
+    known: tuple[Path, ...] = ()
+    """Results (JSON of this command, same profile and minutes) whose cells count as done: those of other machines, or
+    of docs/results. Figures are drawn of the cells that ran in OUT."""
     merge_only: bool = False
     """Run nothing: merge, print and draw what is there."""
     out: Path = Path("runs/reproduce")

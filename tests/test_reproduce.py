@@ -471,3 +471,58 @@ def test_a_real_cell_trains_tests_and_goes_on_where_it_was(tmp_path: Path, monke
     assert len(list((tmp_path / "data").glob("*.h5"))) == 2
     rest = (read_record(cells[1].path(tmp_path / "cells")) or {})["values"]
     assert 0 < rest["chaser 5"] < rest["chaser 40"]
+
+
+def test_cells_of_another_machine_are_taken_for_done_and_merged(fake: Fake, tmp_path: Path, capsys):
+    """The same as if all had run here; of what ran elsewhere nothing is drawn."""
+    drawn: list[Cell] = []
+
+    def figure(folder: Path, done) -> list[Path]:
+        drawn.extend(cell for cell, _ in done)
+        return []
+
+    sys.modules["fake_experiment"].FAKE = replace(fake.experiment, figure=figure)
+    one, other, all_here = (tmp_path / name for name in ("one", "other", "all"))
+    call = ["reproduce", "fake", "--profile", "cpu", "--rows", "best"]
+    assert main([*call, "--seeds", "0", "1", "--out", str(one)]) == 0
+    assert main([*call, "--seeds", "0", "1", "2", "--out", str(all_here)]) == 0
+    known = ["--known", str(one / "cpu" / "fake.json"), "--out", str(other)]
+    fake.calls.clear()
+    drawn.clear()
+    for _ in range(2):  # again: all is done
+        assert main([*call, "--seeds", "0", "1", "2", *known]) == 0
+    fresh = [Cell("best", data, 2) for data in ("one", "two")]
+    assert fake.calls == fresh
+    assert drawn == 2 * fresh
+    printed = capsys.readouterr().err
+    assert "4 cells taken for done" in printed
+    assert "0 cells taken for done" in printed
+    here, there = (json.loads((place / "cpu" / "fake.json").read_text()) for place in (all_here, other))
+    for row in (*here["rows"], *there["rows"]):
+        del row["wall_seconds"]
+    assert there["rows"] == here["rows"]
+    assert there["missing"] == here["missing"]
+    assert [cell["values"] for cell in there["cells"]] == [cell["values"] for cell in here["cells"]]
+
+
+def test_known_results_that_do_not_fit_are_refused_before_anything_is_written(fake: Fake, tmp_path: Path, capsys):
+    out = ["--profile", "cpu", "--out", str(tmp_path / "out")]
+    assert main(["reproduce", "fake", "--profile", "cpu", "--seeds", "0", "--out", str(tmp_path)]) == 0
+    file = tmp_path / "cpu" / "fake.json"
+    document = json.loads(file.read_text())
+    strange, torn = [dict(document["cells"][0], row="worst")], [{"row": "best"}]
+    cases = {
+        "minutes 5.0 -> 2.0": (document, ["--minutes", "2"]),
+        "no cell worst / one / seed 0": (document | {"cells": strange}, []),
+        "a cell lacks data, seed": (document | {"cells": torn}, []),
+        "results of 'table-3.1', not of 'fake'": (document | {"name": "table-3.1"}, []),
+        "carries no cells": ({k: v for k, v in document.items() if k != "cells"}, []),
+        "is no document of results": ([1, 2], []),
+    }
+    for said, (content, more) in cases.items():
+        file.write_text(json.dumps(content))
+        assert main(["reproduce", "fake", "--known", str(file), *more, *out]) == 2
+        assert said in capsys.readouterr().err
+    assert main(["reproduce", "fake", "--known", str(tmp_path / "nothing.json"), *out]) == 2
+    assert "cannot be read" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

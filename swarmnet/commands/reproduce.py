@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 from swarmnet.config import Reproduce
 from swarmnet.reproduce.cells import claimed, records, run_cells
+from swarmnet.reproduce.elsewhere import ELSEWHERE, adopt
 from swarmnet.reproduce.experiment import PROFILES, REGISTRY, Experiment, find
 from swarmnet.reproduce.merge import merge, table
 from swarmnet.results import Results, write_results
@@ -38,6 +39,8 @@ def run(config: Reproduce) -> int:
         print(f"{title}: {found} ({record['wall_seconds']:.0f} s)", file=sys.stderr, flush=True)
         merged()
 
+    for document in config.known:
+        print(f"{document}: {adopt(experiment, document, effort, folder)} cells taken for done", file=sys.stderr)
     if not config.merge_only:
         with helpers(config) as running:
             outcome = run_cells(experiment, cells, effort, folder, finished=finished)
@@ -50,9 +53,9 @@ def run(config: Reproduce) -> int:
     results = merged()
     print(table(results))
     print(f"\n{file}")
-    done = [(cell, record) for cell, record in records(experiment, folder) if "values" in record]
-    if experiment.figure and done:
-        for path in experiment.figure(folder, done):
+    here = [pair for pair in records(experiment, folder) if "values" in pair[1] and ELSEWHERE not in pair[1]]
+    if experiment.figure and here:
+        for path in experiment.figure(folder, here):
             print(path)
     return 1 if results.more["failed"] else 0
 

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from swarmnet.reproduce.cells import records
+from swarmnet.reproduce.elsewhere import carried
 from swarmnet.reproduce.experiment import Cell, Experiment
 from swarmnet.results import Results, Row, unfinished
 
@@ -33,6 +34,7 @@ def merge(experiment: Experiment, planned: Sequence[Cell], folder: Path, *, prof
             **({"notes": experiment.notes} if experiment.notes else {}),
             "missing": [asdict(cell) for cell in planned if cell not in have],
             "failed": [asdict(cell) | {"reason": record["failed"]} for cell, record in found if "failed" in record],
+            "cells": carried([record for _, record in done]),
         },
     )
 
