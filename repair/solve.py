@@ -1,5 +1,6 @@
 """Emits a program to a solver, and believes nothing that it says before the values are put into the program's rows."""
 
+import contextlib
 import time
 import warnings
 from collections.abc import Callable
@@ -269,11 +270,8 @@ def _cvxpy(program: Program, limits: Limits, solver: str) -> _Answer:
         data, chain, inverse = problem.get_problem_data(solver)
         assert chain is not None
         raw = chain.solve_via_data(problem, data, solver_opts=options)
-        try:
+        with contextlib.suppress(cp.SolverError, KeyError):  # a limit without an incumbent, of SCIP
             problem.unpack_results(raw, chain, inverse)
-            status = str(problem.status)
-        except (cp.SolverError, KeyError):  # cvxpy's words for a limit without an incumbent, of SCIP
-            status = "solver_error"
     values = None if x.value is None else np.asarray(x.value, float)
     if solver == "HIGHS":
         feasible = raw["info"].primal_solution_status == highspy.SolutionStatus.kSolutionStatusFeasible
@@ -286,15 +284,34 @@ def _cvxpy(program: Program, limits: Limits, solver: str) -> _Answer:
         ended = ends.get(said, "limit" if said.endswith("limit") else "failed")
         values = values if model.getNSols() else None
         return _Answer(ended, said, values, float(model.getDualbound()), int(model.getNNodes()))
-    return _of_gurobi(raw, status, values)
+    return _of_gurobi(program, raw["model"], values)
 
 
-def _of_gurobi(raw: Any, status: str, values: np.ndarray | None) -> _Answer:
-    ends: dict[str, Any] = {"optimal": "optimal", "infeasible": "infeasible", "unbounded": "unbounded"}
-    ends |= {"infeasible_or_unbounded": "either", "user_limit": "limit", "optimal_inaccurate": "limit"}
-    model = raw["model"]
-    found = values if model.SolCount else None
-    return _Answer(ends.get(status, "failed"), status, found, float(model.ObjBound), int(model.NodeCount))
+_GUROBI_ENDS: dict[int, tuple[Any, str]] = {
+    2: ("optimal", "OPTIMAL"),
+    3: ("infeasible", "INFEASIBLE"),
+    4: ("either", "INF_OR_UNBD"),
+    5: ("unbounded", "UNBOUNDED"),
+    7: ("limit", "ITERATION_LIMIT"),
+    8: ("limit", "NODE_LIMIT"),
+    9: ("limit", "TIME_LIMIT"),
+    10: ("limit", "SOLUTION_LIMIT"),
+    11: ("limit", "INTERRUPTED"),
+    16: ("limit", "WORK_LIMIT"),
+    17: ("limit", "MEM_LIMIT"),
+}
+"""By `Model.Status`: a limit without an incumbent is "infeasible_inaccurate" in cvxpy's words."""
+
+
+def _of_gurobi(program: Program, model: Any, values: np.ndarray | None) -> _Answer:
+    if model.Status == 1:  # only loaded: why, cvxpy has swallowed
+        try:
+            model.optimize()
+        except Exception as error:
+            evidence: dict[str, Any] = dict(program.size)
+            raise RepairError(f"Gurobi does not take the program ({error})", **evidence) from error
+    ended, said = _GUROBI_ENDS.get(model.Status, ("failed", f"status {model.Status}"))
+    return _Answer(ended, said, values if model.SolCount else None, float(model.ObjBound), int(model.NodeCount))
 
 
 def _options(solver: str, limits: Limits) -> dict[str, Any]:

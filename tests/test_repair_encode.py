@@ -27,7 +27,7 @@ from repair.limits import executed
 from repair.network import Situations, actions, situations_of
 from repair.problem import Problem, actions_of, deviation, outputs, state_change, violations
 from repair.program import columns, each
-from repair.solve import Limits, solve
+from repair.solve import Limits, installed, solve
 from swarm_mjcf.errors import SpecError
 
 CONFIG = replace(PRESETS["thesis-ch5"], edge_hidden=(3,), message=2, node_hidden=(3,))
@@ -356,7 +356,7 @@ def test_solvers_agree():
     params, situations = network(), crowded()
     problem = constrained(situations, params, price=20.0)
     program = encode(params, problem, free="edge/obstacle/layer1", radius=0.3).program
-    costs = [solve(program, solver=solver).incumbent for solver in ("highspy", "HIGHS", "SCIP")]
+    costs = [solve(program, solver=solver).incumbent for solver in installed()]
     np.testing.assert_allclose(costs, costs[0], rtol=1e-3)
     stopped = solve(program, solver="HIGHS", limits=Limits(seconds=0.0))
     assert (stopped.status, stopped.values) == (Status.NO_INCUMBENT, None)

@@ -1,6 +1,8 @@
 """Programs as data, and solvers that are not believed."""
 
+import types
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -8,10 +10,11 @@ from scipy import sparse
 
 from repair.errors import RepairError, SolverMissing, Status, Unbounded
 from repair.program import SLACK, Builder, Linear, Program, columns, constant, each
-from repair.solve import Limits, Solver, installed, solve
+from repair.solve import Limits, Solver, _of_gurobi, installed, solve
 from swarm_mjcf.errors import SpecError
 
-SOLVERS: tuple[Solver, ...] = ("highspy", "HIGHS", "SCIP")
+SOLVERS = tuple(solver for solver in get_args(Solver) if solver != "GUROBI" or solver in installed())
+"""Gurobi where it is installed: its wheel comes with a licence for programs as small as these."""
 
 
 def knapsack(values, weights, room: float) -> Program:
@@ -147,6 +150,22 @@ def test_at_a_limit_with_an_incumbent(solver):
     assert solution.bound is not None
     assert program.excess(solution.values) <= 1e-6
     assert solution.bound < solution.incumbent < 0
+
+
+def test_gurobis_own_words_are_told_apart():
+    """Its model without Gurobi, whose licence may end at 2000 variables."""
+
+    def optimize():
+        raise ValueError("Model too large for size-limited license")
+
+    model = types.SimpleNamespace(Status=9, SolCount=0, ObjBound=-4.0, NodeCount=7.0, optimize=optimize)
+    answer = _of_gurobi(knapsack([1.0], [1.0], 1.0), model, np.zeros(1))
+    assert (answer.ended, answer.said, answer.values, answer.bound) == ("limit", "TIME_LIMIT", None, -4)
+    model.Status = 1
+    with pytest.raises(RepairError, match=r"size-limited license.*columns 1"):
+        _of_gurobi(knapsack([1.0], [1.0], 1.0), model, None)
+    model.Status = 12
+    assert _of_gurobi(knapsack([1.0], [1.0], 1.0), model, None).ended == "failed"
 
 
 def test_a_start_is_an_incumbent():
