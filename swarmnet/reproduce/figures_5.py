@@ -271,10 +271,10 @@ ZERO_SHOT = {name: replace(WORLD, num_agents=agents, mixed=False) for name, agen
 
 
 def run_5_3(cell: Cell, effort: Effort, folder: Path, progress: Update) -> dict[str, float]:
-    """Judges figure 5.2's policies, from 1k demonstrations, in scenes of a kind that they were not trained in."""
+    """Judges figure 5.2's policies, of column `1k longer`, in scenes of a kind that they were not trained in."""
     world, most = ZERO_SHOT[cell.data], replace(effort, test_scenes=TESTED * effort.test_scenes)
     scenes = few(most, world.num_agents).test_scenes if cell.data in CROWDS else most.test_scenes
-    found = policies_of(cell, FEW, effort, folder, progress).judged(cell.row, replace(world, scenes=scenes), folder)
+    found = policies_of(cell, LONGER, effort, folder, progress).judged(cell.row, replace(world, scenes=scenes), folder)
     return _titled(cell.data, found, FIGURE_5_3)
 
 
@@ -389,7 +389,7 @@ FIGURE_5_3 = Borrowing(
     leading=(IMITATED, "mode 0"),
     untrained=(EXPERT,),
     unit="as named",
-    notes=f"Policies from 1k demonstrations of 1 to 5 agents, trained as in figure 5.2. {_JUDGED} Crowds have no room "
+    notes=f"Policies of figure 5.2, column `{LONGER}`, which have seen 1 to 5 agents. {_JUDGED} Crowds have no room "
     "within 15 m of the goal.",
     figure=draw_5_3,
 )  # fmt: skip
@@ -397,11 +397,11 @@ FIGURE_5_4 = Borrowing(
     name="figure-5.4",
     about="how far the policies of modes 0, 1, 2 go from the imitation policy, in all unseen scenes and in one",
     rows=tuple(row for row in ROWS if row != SCRATCH),
-    data_sets=(_columns(FEW, *interval(TOUCHING), AWAY, AWAY_SHOWN),),
+    data_sets=(_columns(LONGER, *interval(TOUCHING), AWAY, AWAY_SHOWN),),
     run=run_5_4,
     leading=(IMITATED,),
     untrained=(EXPERT,),
     unit="as named",
-    notes=f"Policies of figure 5.2. MSE: mean squared distance of the same agents from the same start. {_JUDGED}",
+    notes=f"Policies of figure 5.2, column `{LONGER}`. MSE: mean squared distance of the same agents from the same start. {_JUDGED}",
     figure=draw_5_4,
 )
