@@ -22,6 +22,7 @@ from envs.storage import save
 from gnn.checkpoint import Checkpoints, describe, load_model
 from gnn.config import PRESETS, TrainConfig
 from gnn.decode import Integrator
+from swarm_mjcf.errors import SwarmError
 from swarmnet.cli import main, parse
 from swarmnet.commands.certify import unpacked
 
@@ -40,7 +41,7 @@ def _quickly():
         yield
 
 
-def write_model(folder: Path, preset: str) -> Path:
+def write_model(folder: Path, preset: str, world: SimulateConfig = WORLD) -> Path:
     """A run folder with few random weights, as `swarmnet train` leaves it."""
     config = learning.tiny("best")
     if preset != "best":
@@ -48,7 +49,7 @@ def write_model(folder: Path, preset: str) -> Path:
     history, _, graph = learning.random_swarm(3, (1, 1, 3))
     params, scene = learning.initial(config, learning.scales(), history, graph, 3), WORLD.world().scene
     motion = Integrator(scene.dt, scene.substeps, scene.max_speed, scene.max_acceleration)
-    data = {"expert": "boids", "scenes": 4, "simulate": plain(WORLD)}
+    data = {"expert": "boids", "scenes": 4, "simulate": plain(world)}
     about = {"preset": preset, "data": data, "train": plain(TrainConfig(model=preset))}
     checkpoints = Checkpoints(folder / "checkpoints")
     state = {"params": jax.tree.map(jax.numpy.asarray, params)}
@@ -88,6 +89,25 @@ def fails(capsys, *arguments: str) -> str:
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith("swarmnet: ")
     return line
+
+
+def test_the_noise_of_the_training_world_is_in_the_rounds_too(tmp_path: Path, monkeypatch):
+    """The same weights from the same starts: only the noise takes them elsewhere."""
+    ends = []
+
+    def stopped(model, how, bodies, perform, **_):
+        ends.append(perform(model.params, 0).nodes)
+        raise SwarmError("enough")
+
+    monkeypatch.setattr(command, "repair", stopped)
+    for number, noise in enumerate((0.0, 0.5)):
+        run = write_model(tmp_path / f"given-{number}", "thesis-ch5-small", replace(WORLD, actuation_noise=noise))
+        assert main(("repair", str(run), "--run", str(tmp_path / f"run-{number}"), *SMALL)) == 2
+    quiet, noisy = ends
+    np.testing.assert_array_equal(quiet[:, 0], noisy[:, 0])
+    apart = np.linalg.norm(quiet[:, 1, -3:, :2] - noisy[:, 1, -3:, :2], axis=-1)
+    # One control step moves a position by c * noise, c = dt^2 (k + 1) / 2k = 0.048 s^2.
+    assert 0.5 * 0.048 < apart.mean() / 0.5 < 2 * 0.048
 
 
 def test_from_one_end_to_the_other(given: Path, tmp_path: Path, capsys):

@@ -8,7 +8,9 @@ import jax
 import numpy as np
 
 from envs.plain import plain
+from envs.simulate import with_noise
 from gnn.checkpoint import Checkpoints, Model, load_model
+from gnn.decode import make_policy
 from gnn.train import fingerprint
 from repair.config import LoopConfig
 from repair.linearise import FreeWeights
@@ -43,8 +45,11 @@ def run(config: Repair) -> int:
     least = {name: value for name in ("min_agents", "min_obstacles") if (value := getattr(config, name)) is not None}
     world = replace(world, spawn=replace(world.spawn, **least))
     examples = concatenate_fitted([unpacked(path) for path in config.examples])
+    # The noise of the training world is on what it perceives and does here too; what is repaired is what it decides
+    # in the states that it comes to.
+    policy = with_noise(make_policy(model.config, model.scales, goal=world.scene.goal), simulated)
     perform = make_perform(
-        model, world, scenes=how.scenes, steps=how.steps, seed=SCENES + how.seed, engine=config.engine
+        model, world, scenes=how.scenes, steps=how.steps, seed=SCENES + how.seed, engine=config.engine, policy=policy
     )
     _claim(config.run, how, model, asked | least | {"examples": [str(path) for path in config.examples]})
     if _done(config.run):

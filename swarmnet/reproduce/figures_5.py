@@ -402,6 +402,7 @@ FIGURE_5_4 = Borrowing(
     leading=(IMITATED,),
     untrained=(EXPERT,),
     unit="as named",
-    notes=f"Policies of figure 5.2, column `{LONGER}`. MSE: mean squared distance of the same agents from the same start. {_JUDGED}",
+    notes=f"Policies of figure 5.2, column `{LONGER}`. MSE: mean squared distance of the same agents from the same "
+    f"start. {_JUDGED}",
     figure=draw_5_4,
 )
