@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from envs.estimates import Bootstrap, Estimate
 from envs.trajectories import AGENT, GOAL, Trajectories
@@ -49,8 +49,8 @@ def collision_report(trajectories: Trajectories, *, reach: float = NEAR_GOAL, se
     clearance = float(_clearance(t).min(initial=np.inf))
     report["minimum_clearance"] = Estimate(-deepest if deepest > 0 else clearance, None, None, "m")
     if (t.kind == GOAL).any():
-        goal = t.position[np.arange(len(t)), :, np.argmax(t.kind == GOAL, axis=1)]  # (S, T, 2)
-        distance = np.linalg.norm(t.position - goal[:, :, None], axis=-1)
+        distance, known = goal_distances(t)
+        present, steps = present & known, steps & known[:, 1:]
         there = present[:, -1]
         report["final_goal_distance"] = bootstrap.ratio((distance[:, -1] * there).sum(1), there.sum(1), "m")
         arrived = (distance <= reach) & present
@@ -61,6 +61,13 @@ def collision_report(trajectories: Trajectories, *, reach: float = NEAR_GOAL, se
         share("agent_contact_steps_en_route", either, steps & ~near)
         share("agent_contact_steps_near_goal", either, steps & near)
     return report
+
+
+def goal_distances(t: Trajectories) -> tuple[Float[np.ndarray, "S T V"], Bool[np.ndarray, "S T 1"]]:
+    """Distance [m] of every node to its scene's goal, the first of several; and whether there is one in that row."""
+    scene, node = np.arange(len(t)), np.argmax(t.kind == GOAL, axis=1)
+    known = (t.mask[scene, :, node] & (t.kind[scene, node] == GOAL)[:, None])[..., None]
+    return np.linalg.norm(t.position - t.position[scene, :, node][:, :, None], axis=-1), known
 
 
 @dataclass(frozen=True)

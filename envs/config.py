@@ -214,6 +214,10 @@ def mixed(world: World, *, min_agents: int = 1, min_obstacles: int = 0) -> World
     return replace(world, spawn=replace(world.spawn, min_agents=min_agents, min_obstacles=min_obstacles))
 
 
+SEEDS = 2**32
+"""Seeds are below: a key is made of 32 bits, and a larger seed would be the alias of a smaller one."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimulateConfig:
     """What to simulate: a preset world, how many scenes, and by which engine."""
@@ -267,9 +271,11 @@ class SimulateConfig:
         for field in ("scenes", "steps", "num_agents", "chunk"):
             if getattr(self, field) < 1:
                 raise SpecError(field, getattr(self, field), "at least 1")
-        for field in ("num_obstacles", "seed", "threads"):
+        for field in ("num_obstacles", "threads"):
             if (getattr(self, field) or 0) < 0:
                 raise SpecError(field, getattr(self, field), "at least 0")
+        if not 0 <= self.seed < SEEDS:
+            raise SpecError("seed", self.seed, f"a whole number in 0..{SEEDS - 1}")
         for field, unit in (("perception_noise", "m and m/s"), ("actuation_noise", "m/s^2")):
             if not 0 <= getattr(self, field) < math.inf:
                 raise SpecError(field, getattr(self, field), f"a finite number of at least 0 [{unit}]")

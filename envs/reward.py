@@ -1,6 +1,7 @@
 """The reward of the thesis (eq. 5.26-5.27), term by term; what collides is told by contacts, or by what you pass."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax.numpy as jnp
 from jaxtyping import Float, Int
@@ -8,9 +9,16 @@ from jaxtyping import Float, Int
 from envs.config import RewardConfig
 from envs.record import Array, record
 from envs.state import Contacts, State
+from swarm_mjcf.spec import SceneSpec
 
 Collisions = Callable[[State, Contacts], tuple[Array, Array]]
 """`(state, contacts) -> (with agents, with solids)`, both int (S, N): collisions charged for the step that led here."""
+
+
+def coefficients(reward: RewardConfig | None, spec: SceneSpec) -> RewardConfig:
+    """Those asked for, the published ones by default; nothing is paid for a goal in scenes that have none."""
+    chosen = RewardConfig() if reward is None else reward
+    return chosen if spec.goal else replace(chosen, goal_gain=0.0, goal_offset=0.0)
 
 
 @record

@@ -96,15 +96,15 @@ def simulate(
     was. A file that already holds exactly this is kept. Raises TrajectoryError if the file holds something else.
     """
     path = Path(path)
-    about = provenance(config, shard)
+    folder, about = path.with_name(path.name + ".parts"), provenance(config, shard)
     if path.exists():
         header = read_header(path)
         if [header.provenance.get(key) for key in _IDENTITY] != [about.get(key) for key in _IDENTITY]:
             raise TrajectoryError(
                 f"{path}: exists and was made with other settings; choose another name or delete it first"
             )
+        shutil.rmtree(folder, ignore_errors=True)  # of a call that was killed once the file was whole
         return header
-    folder = path.with_name(path.name + ".parts")
     names = {
         scenes: folder / f"{about['fingerprint']}-{scenes.start:09d}-{scenes.stop:09d}.h5"
         for scenes in chunks(config, shard)

@@ -1,5 +1,6 @@
 """Presets of the model family and of its training, as plain data. Standard library only."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -162,6 +163,8 @@ class TrainConfig:
         return sum(self.stage_steps)
 
     def scaled(self, factor: float) -> "TrainConfig":
-        """The same curriculum with `factor` times the steps, in whole chunks."""
+        """The same curriculum with `factor` times the steps, in whole chunks. Raises SpecError."""
+        if not 0 < factor < math.inf:
+            raise SpecError("scale", factor, "a finite number above 0")
         steps = tuple(max(1, round(n * factor / self.chunk)) * self.chunk for n in self.stage_steps)
         return replace(self, stage_steps=steps)

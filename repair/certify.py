@@ -74,7 +74,11 @@ class Certificate:
     counter_examples: Situations
     """States in which an action would keep the barrier and the policy's does not, verified one by one in float64."""
     slack: Float[Values, " X"]
-    """Theirs [m/s^2], negative."""
+    """Theirs [m/s^2], negative, the worst first."""
+    found: int
+    """States of that kind that were come by; `counter_examples` are the worst and a sample of the others."""
+    worst: float | None
+    """Least slack of all [m/s^2]; None where there is none."""
     seconds: float
     cells: int
     """Cells looked at."""
@@ -264,6 +268,8 @@ def certify(
         contested=1 - harmless - hopeless,
         counter_examples=ring.situations(points),
         slack=worst,
+        found=len(found),
+        worst=found.worst,
         seconds=time.monotonic() - started,
         cells=seen,
     )
@@ -382,6 +388,14 @@ class _Found:
         """At most `most` of them, worst first."""
         points = np.concatenate([np.zeros((0, coordinates)), *self.points])
         slack = np.concatenate([np.zeros(0), *self.slack])
-        chosen = np.unique(np.linspace(0, len(slack) - 1, min(self.most, len(slack))).astype(int))
+        spread = np.linspace(0, len(slack) - 1, min(self.most, len(slack))).astype(int)
+        if len(spread):
+            spread[np.argmin(np.abs(spread - np.argmin(slack)))] = np.argmin(slack)
+        chosen = np.unique(spread)
         chosen = chosen[np.argsort(slack[chosen], kind="stable")]
         return points[chosen], slack[chosen]
+
+    @property
+    def worst(self) -> float | None:
+        """Least slack of all."""
+        return min((float(part.min()) for part in self.slack if len(part)), default=None)

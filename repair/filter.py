@@ -16,7 +16,7 @@ from repair.encounters import Bodies, encounters
 from repair.network import Situations
 
 TIGHTEST = 8
-"""Conditions of an agent that are looked at: those with the least slack."""
+"""Conditions of an agent whose lines are tried, those with the least slack; all of them are checked."""
 TOLERANCE = 1e-4
 """By how much an action may violate a condition and still count as allowed [m/s^2]."""
 
@@ -28,13 +28,30 @@ def nearest_allowed(
 
     A quadratic program in two variables, solved exactly: its solution is the action itself, its projection on one line
     or on the circle, or where two of these meet; all are tried at once. Where nothing is allowed: the one of them that
-    violates the worst condition least. Only the `TIGHTEST` conditions are looked at.
+    violates the worst condition least. Of more than `TIGHTEST` conditions, those that are tightest at the action give
+    the lines, and then those that are tightest there or where that led to: nearly always exact, and what counts as
+    allowed satisfies all.
     """
     xp = action.__array_namespace__()
     action = _within(xp, action, limit)
+    tight = xp.sum(planes.normal * action[:, None], axis=-1) - planes.offset
+    found, possible = _among(action, planes, tight, limit)
+    if planes.offset.shape[1] <= TIGHTEST:
+        return found, possible
+    there = xp.sum(planes.normal * found[:, None], axis=-1) - planes.offset
+    other, fits = _among(action, planes, xp.minimum(tight, there), limit)
+    nearer = xp.sum((other - action) ** 2, axis=-1) < xp.sum((found - action) ** 2, axis=-1)
+    better = fits & (nearer | ~possible)
+    return xp.where(better[:, None], other, found), possible | fits
+
+
+def _among(
+    action: Float[Array, "R 2"], planes: HalfPlanes, tight: Float[Array, "R J"], limit: float
+) -> tuple[Float[Array, "R 2"], Bool[Array, " R"]]:
+    """The nearest of what the lines of the least `tight` give, judged by all."""
+    xp = action.__array_namespace__()
     lines = min(TIGHTEST, planes.offset.shape[1])
-    slack = xp.sum(planes.normal * action[:, None], axis=-1) - planes.offset
-    order = xp.argsort(slack, axis=1)[:, :lines]
+    order = xp.argsort(tight, axis=1)[:, :lines]
     n = xp.take_along_axis(planes.normal, order[..., None], axis=1)
     b = xp.take_along_axis(planes.offset, order, axis=1)
     real = xp.isfinite(b)
@@ -56,7 +73,8 @@ def nearest_allowed(
         foot = xp.clip(b, -limit, limit)[..., None] * n
         tried += [foot + along * across, foot - along * across]
     tried = _within(xp, xp.concatenate(tried, axis=1), limit)
-    worst = xp.max(xp.where(real[:, None], b[:, None] - xp.sum(n[:, None] * tried[:, :, None], axis=-1), -1e9), axis=-1)
+    missed = planes.offset[:, None] - xp.sum(planes.normal[:, None] * tried[:, :, None], axis=-1)
+    worst = xp.max(missed, axis=-1, initial=-1e9)
     fits = worst <= TOLERANCE
     away = xp.sum((tried - action[:, None]) ** 2, axis=-1)
     possible = xp.any(fits, axis=1)
@@ -94,6 +112,10 @@ def safe_actions(
     return safe, possible
 
 
+def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:
+    return present[:, :, None] & present[:, None] & ~jnp.eye(present.shape[1], dtype=bool)
+
+
 def make_filtered(
     policy: Policy, constraint: Constraint, bodies: Bodies, kinematics: Kinematics, *, goal: bool = True
 ) -> Policy:
@@ -111,7 +133,8 @@ def make_filtered(
             senders={name: jnp.repeat(part, agents, axis=0) for name, part in parts.items()},
             present={
                 "obstacle": jnp.asarray(graph.obstacle).reshape(-1, obstacles),
-                "agent": jnp.asarray(graph.agent).reshape(-1, agents),
+                # Everybody else, also where the network hears of its target alone.
+                "agent": _others(jnp.asarray(graph.present)[:, first:]).reshape(-1, agents),
             },
         )
         flat = limited(situations.own[:, 2:], jnp.asarray(wanted).reshape(-1, 2), kinematics)

@@ -44,7 +44,7 @@ def least_distance(
     z = psi.T @ (multipliers[:, None] * normal) / 2
     gain, square = float(offset @ multipliers), float(np.sum(z * z))
     if gain <= 0:
-        return 0.0, z, multipliers
+        return 0.0, np.zeros_like(z), np.zeros_like(multipliers)
     # The best multiple of the multipliers: of a certificate that nothing is feasible, a very large one.
     most = float(np.min(np.where(multipliers > 0, price / np.maximum(multipliers, 1e-300), np.inf)))
     scale = min(gain / (2 * max(square, 1e-300)), most)

@@ -7,6 +7,7 @@ there is no such theorem for loops of this kind.
 
 import json
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -175,7 +176,7 @@ def _readable(path: Path) -> Iterator[Any]:
     try:
         with np.load(path, allow_pickle=False) as found:
             yield found
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+    except (OSError, ValueError, TypeError, LookupError, EOFError, BadZipFile, zlib.error) as error:
         raise SwarmError(f"{path}: is damaged; remove it and the rounds after it, and the repair goes on") from error
 
 
@@ -239,6 +240,7 @@ def repair(
         kept = work.load(number) if number < config.rounds else None
         if kept is not None:
             params = kept
+            began = time.perf_counter() - work.history[-1]["through"]  # seconds of the rounds that are done count
             tell(number + 1, config.rounds + 1, work.history[-1])
             continue
         situations, found, row = work.judged(params, number)
@@ -250,7 +252,7 @@ def repair(
         lessons, hard = work.lessons(situations, params, number), situations.take(_worst(found, config.hard))
         if number == 0 and examples is not None:
             more = fitted(examples, situations)
-            lessons = _joined(lessons, work.lessons(more, params, number))
+            lessons = _joined(work.lessons(more, params, number), lessons)
             wrong = screen(work.must, more, work.act(params, more), bodies, work.kinematics)
             hard = concatenate([hard, more.take(np.flatnonzero(wrong.avoidable))])
         work.pool.add(lessons)
@@ -260,7 +262,7 @@ def repair(
             params, seen = descent(params, work.pool, seed=config.seed + number, progress=within)
         else:
             params, seen = _programmed(work, params, number, within)
-        work.history[-1] |= seen
+        work.history[-1] |= seen | {"through": time.perf_counter() - began}
         work.save(number, params, lessons, hard)
     best = min(range(len(work.candidates)), key=lambda i: _score(work.history[i]))
     rows = concatenate(work.hard)
@@ -272,8 +274,9 @@ def repair(
         if row["contact_steps"] <= 2 * work.history[best]["contact_steps"] + 1e-3:
             params, best = polished, config.rounds + 1
     verification = verify(
-        params, model.scales, rows, work.must, bodies, work.kinematics, normalise=work.normalise, before=work.origin
-    )
+        params, model.scales, rows, work.must, bodies, work.kinematics, normalise=work.normalise, before=work.origin,
+        possible=True,
+    )  # fmt: skip
     status = Status.FEASIBLE if verification.holds_as_executed else Status.ELASTIC
     return Repaired(params, status, best, verification, rows, time.perf_counter() - began, None, work.history)
 
@@ -289,16 +292,16 @@ def _once(work: _Work, tell: Progress, began: float) -> Repaired:
     chosen = np.sort(rng.permutation(len(situations))[: config.states * agents])
     rows = mendable(model, work.normalise, work.must, situations.take(chosen), work.bodies)
     method = by_programs if config.method == "thesis" else by_branches
-    params, gap = method(model, work.normalise, config, work.must, rows, work.bodies)
+    params, gap, ended = method(model, work.normalise, config, work.must, rows, work.bodies)
     seconds = time.perf_counter() - began
     _, _, row = work.judged(params, 1)
     work.history.append(row | {"round": 1, "seconds": time.perf_counter() - began})
     tell(2, 2, work.history[-1])
     found = verify(
         params, model.scales, rows, work.must, work.bodies, work.kinematics, normalise=work.normalise,
-        before=work.origin,
+        before=work.origin, possible=True,
     )  # fmt: skip
-    status = Status.FEASIBLE if found.holds_as_executed else Status.ELASTIC
+    status = ended if not ended.solved else Status.FEASIBLE if found.holds_as_executed else Status.ELASTIC
     return Repaired(params, status, 1, found, rows, seconds, gap, work.history)
 
 
@@ -325,7 +328,7 @@ def _programmed(work: _Work, params: Params, number: int, within: Callable) -> t
     lessons = _doubles(work.pool)
     now = screen(work.aim, lessons.situations, work.act(params, lessons.situations), work.bodies, work.kinematics)
     broken = np.flatnonzero(now.violated & lessons.bound)
-    constrained = rng.permutation(broken)[: work.config.hard]
+    constrained = broken[np.argsort(now.slack[broken], kind="stable")[: work.config.hard]]
     anchors = rng.permutation(len(lessons))[: work.config.anchors]
     problem = work.problem(
         work.aim, lessons.situations.take(constrained), lessons.situations.take(anchors), lessons.target[anchors]

@@ -3,8 +3,8 @@
 The thesis's own (chapter 6) and the last layer with true discs, as the loop's neighbours to compare with.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from repair.config import LoopConfig
 from repair.constraints.constraint import Constraint
 from repair.constraints.disc import Disc
 from repair.encounters import Bodies, encounters
-from repair.layerwise import Step, layerwise
+from repair.errors import Status
+from repair.layerwise import layerwise
 from repair.network import Situations, actions
 from repair.problem import Problem
 from repair.screen import screen
@@ -30,6 +31,16 @@ def mendable(model: Model, normalise: bool, constraint: Constraint, states: Situ
     return states.take(~judged.violated | judged.avoidable)
 
 
+class Mended(NamedTuple):
+    """What a method of one step found."""
+
+    params: Params
+    """Those given where it found none."""
+    gap: float | None
+    status: Status
+    """In the method's own words; without values where it found none."""
+
+
 def by_programs(
     model: Model,
     normalise: bool,
@@ -37,10 +48,9 @@ def by_programs(
     constraint: Constraint,
     states: Situations,
     bodies: Bodies,
-    progress: Callable[[Step], None] | None = None,
-) -> tuple[Params, float | None]:
+) -> Mended:
     """The thesis's layer-wise mixed-integer programs (`repair.layerwise`) on the layers of `config.layers`, conditions
-    elastic; the weights, and the gap of the last program that was accepted.
+    elastic; the gap is that of the last program that was accepted.
 
     The targets are the original actions, deviations count in L1 (eq. 6.9-6.12), conditions are of the raw action.
     """
@@ -53,10 +63,10 @@ def by_programs(
     found = layerwise(
         model.params, problem, radius=config.box, layers=config.layers, rounds=max(config.rounds, 1), limits=limits,
         solver=config.solver,
-        progress=progress,
     )  # fmt: skip
     taken = [step.gap for step in found.history if step.accepted]
-    return found.params, taken[-1] if taken else None
+    solved = [step.status for step in found.history if step.status.solved]
+    return Mended(found.params, taken[-1] if taken else None, solved[-1] if solved else found.history[-1].status)
 
 
 def by_branches(
@@ -66,8 +76,8 @@ def by_branches(
     constraint: Constraint,
     states: Situations,
     bodies: Bodies,
-) -> tuple[Params, float | None]:
-    """The last layer with the least mean squared change of actions that keeps true discs (`repair.branch`); the gap.
+) -> Mended:
+    """The last layer with the least mean squared change of actions that keeps true discs (`repair.branch`).
 
     Raises SpecError for another constraint than disc.
     """
@@ -78,8 +88,9 @@ def by_branches(
         e = replace(e, present=e.present & ~np.asarray(e.steers))
     found = branch_readout(
         model.params, model.scales, states, states, e, constraint, normalise=normalise, price=1e4,
-        seconds=config.solver_seconds,
+        seconds=config.solver_seconds, ceiling=np.inf,
     )  # fmt: skip
     if found.kernel is None or found.bias is None:
-        return model.params, None
-    return model.params | {"readout": {"layer0": {"kernel": found.kernel, "bias": found.bias}}}, found.gap
+        return Mended(model.params, None, found.status)
+    params = model.params | {"readout": {"layer0": {"kernel": found.kernel, "bias": found.bias}}}
+    return Mended(params, found.gap, found.status)

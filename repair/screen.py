@@ -57,7 +57,7 @@ class Screened:
     before_clip: Float[Array, " R"]
     """The same for the network's own output."""
     possible: Bool[Array, " R"]
-    """Whether some admissible action satisfies all conditions."""
+    """Whether some admissible action was found that satisfies all conditions."""
     apart: Bool[Array, " R"]
     """Whether the agent touches nothing yet."""
 
@@ -80,7 +80,8 @@ def screen(
     kinematics: Kinematics,
 ) -> Screened:
     """Judges decisions by the action that is executed. Unavoidable is who is inside already (its surfaces overlap), or
-    for whom no action within the limits satisfies all conditions. An action that is not finite breaks every condition:
+    for whom no action within the limits was found that satisfies all conditions: neither the allowed one nearest to
+    the policy's nor any of a grid. An action that is not finite breaks every condition:
     its slack is -inf."""
     e = encounters(situations, bodies)
     sound = np.isfinite(action).all(axis=1)
@@ -93,14 +94,32 @@ def screen(
         found, fits = safe_actions(constraint, situations.take(asked), done[asked], bodies, kinematics)
         # What is executed of it may differ from it by the speed limit.
         found = executed(situations.own[asked, 2:], found, kinematics)
-        holds = least(constraint, e_take(e, asked), found) >= -TOLERANCE
-        possible[asked] = fits & holds
+        near = e_take(e, asked)
+        possible[asked] = fits & (least(constraint, near, found) >= -TOLERANCE)
+        # The nearest allowed action is not all there is: the speed limit may bend it, and a convex part of what is
+        # allowed may be empty where the rest is not.
+        left = np.flatnonzero(~possible[asked])
+        for other in _around(kinematics.max_acceleration):
+            if not len(left):
+                break
+            tried = executed(situations.own[asked[left], 2:], np.tile(other, (len(left), 1)), kinematics)
+            holds = least(constraint, e_take(near, left), tried) >= -TOLERANCE
+            possible[asked[left[holds]]] = True
+            left = left[~holds]
     return Screened(
         slack=slack,
         before_clip=np.where(sound, least(constraint, e, action), -np.inf),
         possible=possible,
         apart=(gap(e) > 0).all(axis=1) if e.present.shape[1] else np.ones(len(situations), bool),
     )
+
+
+def _around(limit: float) -> Float[np.ndarray, "A 2"]:
+    """Actions all over the disc of the limit: 24 directions at its rim and at two thirds and one third, and none."""
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    size = limit if np.isfinite(limit) else 1.0
+    return np.concatenate([rim * size, rim * size * 2 / 3, rim * size / 3, np.zeros((1, 2))])
 
 
 def least(constraint: Constraint, e: Encounters, action: Float[Array, "R 2"]) -> Float[Array, " R"]:

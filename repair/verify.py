@@ -66,13 +66,17 @@ def verify(
     *,
     normalise: bool = True,
     before: Params | None = None,
+    possible: bool = False,
 ) -> Verification:
     """Puts every row through network, clips and integrator in float64. `before`: weights to compare with.
+    `possible`: of all rows it is known that some action satisfies them, so that every violation is one without need;
+    otherwise that is looked for (`repair.screen`).
 
     An action that is not finite breaks everything.
     """
     action = actions(params, scales, situations, normalise=normalise)
     now = screen(constraint, situations, action, bodies, kinematics)
+    needless = now.violated if possible else now.avoidable
     introduced = mended = deviation = None
     if before is not None:
         old_action = actions(before, scales, situations, normalise=normalise)
@@ -83,11 +87,11 @@ def verify(
     return Verification(
         rows=len(situations),
         violated=int(now.violated.sum()),
-        avoidable=int(now.avoidable.sum()),
+        avoidable=int(needless.sum()),
         violated_before_clip=int((now.before_clip < -TOLERANCE).sum()),
         introduced=introduced,
         mended=mended,
-        worst=float(now.slack[now.possible & now.apart].min(initial=np.inf)),
+        worst=float(now.slack[needless | ~now.violated].min(initial=np.inf)),
         deviation=deviation,
     )
 

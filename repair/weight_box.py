@@ -105,6 +105,10 @@ def polish(
         if cost is not None and (incumbent is None or cost < incumbent):
             best, incumbent = tried, cost
     bound = None if found.status == Status.INFEASIBLE else max(found.bound or 0.0, work.proven)
+    if bound is not None and problem.price is not None:
+        # The program charges for missing the margin too, which the cost does not ask for.
+        count = len(violations(problem, outputs(problem, best)))
+        bound = max(bound - problem.price * problem.margin * count, 0.0)
     gap = None
     if incumbent is not None and bound is not None:
         bound = min(bound, incumbent)  # a start may do without the margin that the bound is of

@@ -1,5 +1,6 @@
 """What PPO learns on: scenes that start, are observed and stepped. `SwarmTask` is the swarm with its reward."""
 
+import math
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -8,10 +9,11 @@ from jaxtyping import Bool, Float, Key
 
 from envs.config import RewardConfig
 from envs.record import Array, record
-from envs.reward import reward_terms
+from envs.reward import coefficients, reward_terms
 from envs.state import State
 from envs.swarm_env import SwarmEnv
 from gnn.graph import Graph, graph_of_state
+from swarm_mjcf.errors import SpecError
 
 World = Any
 """State of S scenes: a tree of arrays with the scenes first."""
@@ -55,11 +57,21 @@ class Task(Protocol):
 
 
 class SwarmTask:
-    """A `SwarmEnv` with the reward of eq. 5.26-5.27, contacts by physics. Actions are accelerations [m/s^2]."""
+    """A `SwarmEnv` with the reward of eq. 5.26-5.27, contacts by physics. Actions are accelerations [m/s^2].
+
+    Raises:
+      SpecError: the world has no finite acceleration limit, or collisions have a price and its contacts are off.
+    """
 
     def __init__(self, env: SwarmEnv, reward: RewardConfig | None = None) -> None:
-        self.env = env
-        self.reward = RewardConfig() if reward is None else reward
+        self.env, self.reward = env, coefficients(reward, env.spec)
+        if not math.isfinite(env.spec.max_acceleration):
+            raise SpecError("max_acceleration", env.spec.max_acceleration, "finite: exploration is scaled by it")
+        if self.reward.collision and not env.spec.contacts:
+            raise SpecError(
+                "contacts", False, "on, as in preset clear: physics counts the collisions that have a price "
+                "(reward.collision); 0 leaves them out",
+            )  # fmt: skip
 
     def start(self, keys: Key[Array, " S"]) -> tuple[State, Bool[Array, " S"]]:
         """See `SwarmEnv.spawn`."""

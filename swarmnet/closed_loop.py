@@ -83,6 +83,8 @@ def stage_of_recording(recording: Trajectories, *, preset: str | None, engine: s
     if (t.mask != t.mask[:, :1]).any():
         raise SwarmError("agents enter or leave during the recording, so no policy can be run from its first row")
     goals, obstacles, agents = (np.flatnonzero(t.kind[0] == kind) for kind in (GOAL, OBSTACLE, AGENT))
+    if len(goals) and not t.mask[:, 0, goals[0]].all():
+        raise SwarmError("some of its scenes have a goal and some have none, so no policy can be run from all of them")
     first = t.position[:, 0]
     start = make_state(
         position=first[:, agents],

@@ -223,6 +223,10 @@ class Doctor:
     json: Path | None = None
     """Also write the results here, machine-readable."""
 
+    def __post_init__(self) -> None:
+        if self.scenes < 1:
+            raise SpecError("scenes", self.scenes, "at least 1")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:

@@ -272,14 +272,28 @@ def _record(folder: Path, reference: Trajectories | None, acted: Trajectories | 
 
 def _check_model(model: Model, stage: Stage) -> None:
     here, scene = stage.simulate, stage.world.scene
-    seen = [(part.get("simulate", {}).get("seed"), part.get("simulate", {}).get("preset")) for part in model.trained_on]
-    if here and stage.starts is None and (here.seed, here.preset) in seen:
-        raise SwarmError(f"seed {stage.seed} is the training data's own; unseen scenes need another seed")
+    if here and stage.starts is None and (here.seed, here.preset) in scenes_seen(model):
+        raise SwarmError(
+            f"seed {stage.seed} is that of scenes that the model learned in; unseen ones need another seed"
+        )
     if (scene.dt, scene.substeps) != (model.integrator.dt, model.integrator.substeps):
         raise SwarmError(
             f"the model was trained at dt {model.integrator.dt} s with {model.integrator.substeps} substeps, this "
             f"world has {scene.dt} s with {scene.substeps}"
         )
+
+
+def scenes_seen(model: Model) -> set[tuple[int | None, str]]:
+    """Seed and preset of the scenes that a model has learned in: of its data, of PPO, of rounds of repair."""
+    simulated = [part["simulate"] for part in model.trained_on if part.get("simulate")]
+    seeds, about = [], model.about
+    while about:
+        seeds += [about.get("rl", {}).get("seed"), about.get("repair", {}).get("scene_seed")]
+        about = about.get("initial")
+    presets = {one["preset"] for one in simulated}
+    return {(one["seed"], one["preset"]) for one in simulated} | {
+        (seed, preset) for seed in seeds for preset in presets
+    }
 
 
 def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, seed: int) -> None:

@@ -180,7 +180,7 @@ def test_barrier_s_margin_pairs_and_absent():
     assert plain.least(ahead(2.0, -6, steers=True)) == pytest.approx(both)
     assert plain.least(ahead(2.0, -6, present=False))[0, 0] == -np.inf
     assert plain.slack(ahead(2.0, -6, present=False), np.zeros((1, 2)))[0, 0] == np.inf
-    # 0.2 m inside at rest: out within the step of 0.3 s.
+    # 0.2 m inside at rest: after the step of 0.3 s it opens at 0.2 / 0.3 m/s, with w = 0.2 / 0.3^2.
     assert plain.least(ahead(-0.2, 0.0))[0, 0] == pytest.approx(0.2 / 0.09)
     # A body that moves is a body at rest, seen from it.
     state = crowd()

@@ -432,9 +432,10 @@ def test_methods_of_one_step_mend_the_states_they_took(method, name):
 def test_a_damaged_round_is_named(tmp_path):
     m = model()
     repair(m, SMALL, BODIES, performing(m), folder=tmp_path)
-    (tmp_path / "round-01.npz").write_bytes(b"PK nothing")
-    with pytest.raises(SwarmError, match=r"round-01.npz: is damaged"):
-        repair(m, SMALL, BODIES, performing(m), folder=tmp_path)
+    for left in (b"PK nothing", b""):
+        (tmp_path / "round-01.npz").write_bytes(left)
+        with pytest.raises(SwarmError, match=r"round-01.npz: is damaged"):
+            repair(m, SMALL, BODIES, performing(m), folder=tmp_path)
 
 
 def test_counter_examples_from_elsewhere_are_learned_and_constrained():
@@ -467,3 +468,34 @@ def test_more_bodies_than_places_are_refused():
     crowded = replace(two, senders=two.senders | {"obstacle": places}, present=two.present | {"obstacle": here})
     with pytest.raises(NotEncodable, match="more than 1 places of type obstacle"):
         fitted(crowded, one)
+
+
+@pytest.mark.parametrize(("method", "name"), [("thesis", "diamond"), ("last-layer", "disc")])
+def test_without_a_solution_the_status_says_so_and_the_weights_are_the_given_ones(method, name):
+    """No time at all, and for the thesis's method a solver without a start."""
+    how = LoopConfig(
+        method=method, constraint=ConstraintConfig(name=name, margin=0.5), scenes=16, steps=6, states=60,
+        solver="HIGHS", solver_seconds=0.0,
+    )  # fmt: skip
+    m = model()
+    found = repair(m, how, BODIES, performing(m))
+    assert found.status == Status.NO_INCUMBENT
+    assert found.gap is None
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(m.params), found.params)
+
+
+def test_what_could_have_been_avoided_does_not_depend_on_what_was_done():
+    """Near the speed limit the allowed action that is nearest to the second one is bent by the clip of the speed into
+    one that is not allowed: then others are tried."""
+    motion = Integrator(dt=0.3, substeps=15, max_speed=10.0, max_acceleration=5.0)
+    own = np.array([[-1.54146, -1.28783, 6.58235, -7.44677]])
+    still = {"obstacle": np.zeros((1, 1, 4)), "agent": np.zeros((1, 1, 4)), "goal": np.zeros((1, 1, 4))}
+    there = {"obstacle": np.ones((1, 1), bool), "agent": np.zeros((1, 1), bool), "goal": np.zeros((1, 1), bool)}
+    state, bodies = (
+        Situations(own=own, senders=still, present=there),
+        SimpleNamespace(agent_radius=1.0, obstacle_radius=1.0),
+    )
+    for action in ([4.066, 4.095], [2.432, 0.588]):
+        judged = screen(Barrier(kinematics=motion), state, np.array([action]), bodies, motion)
+        assert judged.violated.all()
+        assert judged.avoidable.all(), action

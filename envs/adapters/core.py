@@ -12,18 +12,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Key, UInt
 
 from envs.adapters.observation import Observation, nearest
-from envs.config import RewardConfig, make_world, mixed
+from envs.config import SEEDS, RewardConfig, make_world, mixed
 from envs.dynamics import clip_norm
 from envs.policy import Policy
 from envs.record import Array, record
-from envs.reward import Collisions, by_contacts, reward
+from envs.reward import Collisions, by_contacts, coefficients, reward
 from envs.spawn import too_dense
 from envs.state import Contacts, State, no_contacts
 from envs.swarm_env import SwarmEnv
 from swarm_mjcf.errors import SpecError
-
-SEEDS = 2**32
-"""Seeds are below this: JAX's keys take 32 bits."""
 
 
 @record
@@ -89,8 +86,7 @@ class SwarmCore:
             raise SpecError("max_acceleration", env.spec.max_acceleration, "finite: actions are scaled by it")
         self.env, self.spec = env, env.spec
         self.observation = nearest(env.spec) if observation is None else observation
-        coefficients = RewardConfig() if reward is None else reward
-        self.reward = coefficients if env.spec.goal else replace(coefficients, goal_gain=0.0, goal_offset=0.0)
+        self.reward = coefficients(reward, env.spec)
         self._collisions = collisions
         self._start = jax.jit(self._started)
         self.step: Stepper = jax.jit(self._step)

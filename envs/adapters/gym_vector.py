@@ -7,10 +7,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envs.adapters.core import SEEDS, Episodes, Outcome, Stepper, SwarmCore, make_core
+from envs.adapters.core import Episodes, Outcome, Stepper, SwarmCore, make_core
 from envs.adapters.gym_single import check_mode, infos, render_metadata
 from envs.adapters.gym_spaces import scene_spaces
 from envs.adapters.scene import mean_reward
+from envs.config import SEEDS
 from envs.state import State
 from swarm_mjcf.errors import SpecError, SwarmError
 

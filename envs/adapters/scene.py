@@ -6,7 +6,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from envs.adapters.core import SEEDS, Episodes, Outcome, SwarmCore
+from envs.adapters.core import Episodes, Outcome, SwarmCore
+from envs.config import SEEDS
 from envs.record import Array
 from envs.state import State
 from swarm_mjcf.errors import SpecError, SwarmError

@@ -45,7 +45,10 @@ def arrow_column(path: str, ours: str, column: pa.ChunkedArray) -> np.ndarray:
     if ours in TEXT:
         if column.null_count:
             raise ImportFailed(f"{path}: {column.null_count} rows have no {ours}")
-        return np.asarray(pc.utf8_trim_whitespace(column.cast(pa.string())).to_pylist(), dtype=str)  # pyright: ignore[reportAttributeAccessIssue]
+        texts = np.asarray(pc.utf8_trim_whitespace(column.cast(pa.string())).to_pylist(), dtype=str)  # pyright: ignore[reportAttributeAccessIssue]
+        if (texts == "").any():
+            raise ImportFailed(f"{path}: {np.count_nonzero(texts == '')} rows have no {ours}")
+        return texts
     try:
         return np.asarray(column.cast(pa.float64()).to_numpy(), np.float64)
     except pa.ArrowException as error:

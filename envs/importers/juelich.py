@@ -8,6 +8,7 @@ from envs.importers.text import numeric_table
 from envs.importers.tracks import ImportFailed, Tracks, Update, frame_rate, height_fact, length, tracks_of, unit_facts
 
 SHAPE = "the columns id frame x y [z]"
+_BRACKETED = re.compile(r"(?<=\S)\s*[\[(]([^\s\[\]()]+)[\])]")
 _RATE = re.compile(r"frame\s*rate\s*[:=]?\s*([0-9.eE+-]+)", re.IGNORECASE)
 _NAMES = {"id": "id", "frame": "frame", "fr": "frame", "x": "x", "y": "y", "z": "z"}
 
@@ -25,9 +26,7 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
                 said = float(found.group(1))
             except ValueError as error:
                 raise ImportFailed(f"{path}: its header has no number of frames in {comment!r}") from error
-    place, units = _columns(path, comments)
-    if (width := max(place[name] for name in ("id", "frame", "x", "y")) + 1) > table.shape[1]:
-        raise ImportFailed(f"{path}: rows have {table.shape[1]} columns, its header names {width} or more")
+    place, units = _columns(path, comments, table.shape[1])
     rate, rate_fact = frame_rate(str(path), config, said)
     scales, said_of = {}, {}
     for axis in ("x", "y"):
@@ -44,12 +43,17 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
     ]
 
 
-def _columns(path: Path, comments: list[str]) -> tuple[dict[str, int], dict[str, str]]:
-    """Where each column stands, and its unit where the header says one; id frame x y z without a header."""
+def _columns(path: Path, comments: list[str], width: int) -> tuple[dict[str, int], dict[str, str]]:
+    """Where each column stands, and its unit where the header says one (x/m, x[m], x [m], x (m)); id frame x y z
+    without a header. Raises ImportFailed for a header of more or fewer columns than the rows have."""
     for comment in reversed(comments):
-        words = [word.partition("/") for word in comment.split()]
+        words = [word.partition("/") for word in _BRACKETED.sub(r"/\1", comment).split()]
         names = [_NAMES.get(name.lower(), "") for name, _, _ in words]
         if {"id", "frame", "x", "y"} <= set(names):
+            if len(names) != width:
+                raise ImportFailed(
+                    f"{path}: rows have {width} columns, its header names {len(names)}: {comment.strip()}"
+                )
             return (
                 {name: at for at, name in enumerate(names) if name},
                 {name: unit.lower() for name, (_, _, unit) in zip(names, words, strict=True) if name and unit},

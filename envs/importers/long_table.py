@@ -27,6 +27,9 @@ def find_columns(path: str, names: Sequence[str], config: ImportConfig) -> dict[
 
     Raises ImportFailed for a column that is missing, or is named but not there.
     """
+    twice = [name for at, name in enumerate(names) if name in names[:at]]
+    if twice:
+        raise ImportFailed(f"{path}: has the column {twice[0]!r} more than once")
     full = {name: name for name in names}
     for name in names:
         if found := _WITH_UNIT.match(name):

@@ -1,5 +1,6 @@
 """MATLAB v4 and v5 files: one matrix of numbers whose columns are named by number, counted from 1 as in MATLAB."""
 
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,16 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
         raise ImportFailed(f"{path}: is of MATLAB v7.3; save it in MATLAB with save(..., '-v7')")
     try:
         contents = loadmat(path, appendmat=False, chars_as_strings=True, struct_as_record=True)
-    except (MatReadError, NotImplementedError, ValueError, TypeError, OSError, EOFError, KeyError, IndexError) as error:
+    except (
+        MatReadError,
+        NotImplementedError,
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        LookupError,
+        zlib.error,
+    ) as error:
         raise ImportFailed(f"{path}: is no whole MATLAB v5 file ({error})") from error
     update(size, size, f"read {path.name}")
     table = _table(path, contents, config.variable)
@@ -44,6 +54,8 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
     values = {}
     for ours, column in columns.items():
         data = table[:, int(column.name) - 1]
+        if ours in TEXT and not np.isfinite(data).all():
+            raise ImportFailed(f"{path}: {np.count_nonzero(~np.isfinite(data))} rows have no {ours}")
         values[ours] = np.asarray([label(value) for value in data]) if ours in TEXT else data.astype(np.float64)
     return runs_of(str(path), path.name, columns, values, config, {"format": "MATLAB"})
 

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from tokenize import TokenError
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -100,7 +102,7 @@ def _array(path: Path, dimensions: int, shape: str) -> np.ndarray:
     readable(path)
     try:
         array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+    except (ValueError, OSError, EOFError, TokenError, BadZipFile) as error:
         raise ImportFailed(
             f"{path}: is no array of numbers in NumPy's format ({str(error).splitlines()[0]})"
         ) from error

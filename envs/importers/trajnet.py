@@ -33,6 +33,8 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
                     predicted += 1
                     continue
                 rows.append((track["f"], track["p"], track["x"], track["y"]))
+            else:
+                raise KeyError("scene or track")
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise ImportFailed(
                 f"{path}: line {number} is neither a scene with its fps nor a track with f, p, x and y ({error})"

@@ -24,7 +24,8 @@ class Barrier(Motion):
     which is `w >= w_min` with the least w_min that satisfies it, linear in the action. For k -> infinity the set of
     states from which w_min <= b is left by no action that obeys it, along one line of centres. An agent brakes with
     `share` of its largest acceleration; two agents brake together, with 2 b, and each owes half of w_min. Inside the
-    margin the agent has to leave it within a step. Slack is n . u - w_min, in m/s^2.
+    margin the agent has to open, with a speed of -h / dt at the end of the step: that takes one which stood still out
+    of it in one step more. Slack is n . u - w_min, in m/s^2.
     """
 
     share: float = 0.7

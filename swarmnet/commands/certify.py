@@ -2,12 +2,14 @@
 
 import io
 import json
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
+import jax
 import numpy as np
 
 from envs.plain import plain
@@ -48,8 +50,9 @@ def run(config: Certify) -> int:
         **shares(certificate),
         "seconds": round(certificate.seconds, 1),
         "cells": certificate.cells,
+        "found": certificate.found,
         "counter_examples": len(certificate.slack),
-        "worst": float(certificate.slack[0]) if len(certificate.slack) else None,
+        "worst": certificate.worst,
         "commit": commit(),
         "hardware": hardware(),
     }
@@ -58,7 +61,7 @@ def run(config: Certify) -> int:
     write_whole(examples, packed(certificate.counter_examples, certificate.slack))
     print(words(certificate, ring))
     print(f"certificate: {config.run / 'certificate.json'}; counter-examples: {examples}")
-    return int(len(certificate.slack) > 0)
+    return int(certificate.found > 0)
 
 
 def shares(certificate: Certificate) -> dict[str, float]:
@@ -82,7 +85,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             yield arrays
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+    except (OSError, ValueError, TypeError, LookupError, EOFError, BadZipFile, zlib.error) as error:
         raise SwarmError(f"{path}: holds no counter-examples; `swarmnet certify` writes them") from error
 
 
@@ -93,7 +96,10 @@ def unpacked(path: Path) -> Situations:
             part: {name.split("/")[1]: arrays[name] for name in arrays if name.startswith(f"{part}/")}
             for part in ("senders", "present")
         }
-        return Situations(own=arrays["own"], senders=parts["senders"], present=parts["present"])
+        found = Situations(own=arrays["own"], senders=parts["senders"], present=parts["present"])
+        if found.own.shape[1:] != (4,) or {len(x) for x in jax.tree.leaves(found)} != {len(found.own)}:
+            raise ValueError("rows of another shape")
+        return found
 
 
 def words(certificate: Certificate, ring: Ring, examples: int = 2) -> str:
@@ -108,7 +114,7 @@ def words(certificate: Certificate, ring: Ring, examples: int = 2) -> str:
         f"  {c.unavoidable:8.3%} unavoidable: no action within the limit keeps it",
         f"In {c.harmless:.3%} every action keeps it. Of the {c.contested:.3%} in which it is up to the policy, "
         f"{c.kept:.1%} or more are proven.",
-        f"{c.cells} cells in {c.seconds:.1f} s; {len(c.slack)} counter-examples kept.",
+        f"{c.cells} cells in {c.seconds:.1f} s; {c.found} counter-examples, {len(c.slack)} kept.",
     ]
     for row in range(min(examples, len(c.slack))):
         own = np.asarray(c.counter_examples.own[row])

@@ -30,17 +30,16 @@ def run(config: Demo) -> int:
     """Does what is missing in runs/NAME and says what came out."""
     if config.model == "thesis-ch3":
         raise SpecError("model", config.model, "thesis-ch5 or best: the demo's model steers agents, ch3 only predicts")
-    if config.scale <= 0:
-        raise SpecError("scale", config.scale, "above 0")
+    world = SimulateConfig(preset="clear", scenes=config.scenes, seed=config.seed, engine=config.engine)
+    unseen = replace(world, scenes=config.test_scenes, seed=config.seed + TEST_SEED)
+    training = TrainConfig(model=config.model, seed=config.seed).scaled(config.scale)
     started = time.monotonic()
     folder = Path("runs") / config.name
     _claim(folder, config)
-    world = SimulateConfig(preset="clear", scenes=config.scenes, seed=config.seed, engine=config.engine)
     with progress("1/4 simulate") as update:
         simulate(world, folder / "data.h5", progress=update)
     data = load(folder / "data.h5")
     kept = max(1, len(data) // 20)
-    training = TrainConfig(model=config.model, seed=config.seed).scaled(config.scale)
     with progress("2/4 train") as update:
         train(
             training,
@@ -49,17 +48,14 @@ def run(config: Demo) -> int:
             validation=data.take(slice(0, kept)),
             progress=lambda done, total, row: update(done, total, note(row)),
         )
-    judged = folder / "evaluation.json"
-    if not judged.exists():
-        unseen = replace(world, scenes=config.test_scenes, seed=config.seed + TEST_SEED)
-        judgement = judge(
-            load_model(folder / "checkpoints"), unseen, folder, name=f"swarmnet {config.model}", label="3/4 "
-        )
+    judged, name = folder / "evaluation.json", f"swarmnet {config.model}"
+    if not _judged(judged, unseen, name):
+        judgement = judge(load_model(folder / "checkpoints"), unseen, folder, name=name, label="3/4 ")
         write_whole(judged, json.dumps(judgement.plain(), indent=1))
     with progress("4/4 videos") as update:
         make_videos(folder, config.videos, progress=update)
     report = write_report(folder)
-    print(summary(json.loads(judged.read_text()), f"swarmnet {config.model}"))
+    print(summary(json.loads(judged.read_text()), name))
     print(f"\n{report}  <- open this: figures, tables and videos ({time.monotonic() - started:.0f} s)")
     print(f"videos: {folder / 'videos'}   data: {folder / 'data.h5'}   metrics: {folder / 'metrics.jsonl'}")
     # As it was called: `make demo` leaves no `swarmnet` on the search path.
@@ -78,6 +74,15 @@ def _claim(folder: Path, config: Demo) -> None:
         if different:
             raise SwarmError(f"{folder} holds a demo of other settings ({', '.join(different)}); choose another --name")
     write_whole(path, json.dumps(settings, indent=1))
+
+
+def _judged(path: Path, unseen: SimulateConfig, name: str) -> bool:
+    """Whether the demo's own judgement is there, and not that of a later `swarmnet evaluate`."""
+    if not path.exists():
+        return False
+    had = json.loads(path.read_text())
+    wanted = (unseen.seed, unseen.scenes, {"expert", name})
+    return (had.get("seed"), had.get("scenes"), set(had.get("collisions", ()))) == wanted
 
 
 def summary(judgement: dict, name: str) -> str:

@@ -104,7 +104,10 @@ def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired, fresh: di
     `fresh`: contacts in scenes that no round had.
     """
     about = {name: value for name, value in model.about.items() if name != "step"}
-    about |= {"repair": {"settings": plain(how), "status": found.status.value, "of": fingerprint(model.params)}}
+    about["repair"] = {
+        "settings": plain(how), "scene_seed": SCENES + how.seed, "status": found.status.value,
+        "of": fingerprint(model.params),
+    }  # fmt: skip
     checkpoints = Checkpoints(folder / "checkpoints")
     # Of gradient steps of imitation there are as many as before; a newer save of the same repair counts on.
     step = max(checkpoints.latest() or 0, model.about.get("step", 1) - 1) + 1
@@ -128,13 +131,15 @@ def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired, fresh: di
 
 def words(found: Repaired, how: LoopConfig, fresh: dict) -> str:
     """What was done and what holds, in plain words. `fresh`: contacts in scenes that no round had."""
+    once = how.method in ("thesis", "last-layer")
+    what = f"can keep the {how.constraint.name}" if once else f"broke the {how.constraint.name} without need"
     v, before = found.verification, found.history[0]["contact_steps"]
     touched = round(fresh["trajectories"] * fresh["scenes"])
     _, most = clopper_pearson(touched, fresh["scenes"])
     lines = [
         f"status: {found.status.value}, after {found.seconds:.0f} s; weights of round {found.best}",
-        f"  {v.rows} training decisions that broke the {how.constraint.name} without need: "
-        f"{v.avoidable} still do as executed, {v.violated_before_clip} before the limits clip them",
+        f"  {v.rows} training decisions that {what}: "
+        f"{v.avoidable} break it as executed, {v.violated_before_clip} before the limits clip them",
         f"  in {fresh['scenes']} scenes that no round had: contact steps {100 * fresh['contact_steps']:.3g}% (before, "
         f"in others: {100 * before:.3g}%); {touched} scenes with a contact, so with 95% confidence at most "
         f"{100 * most:.2g}% of such scenes have one",

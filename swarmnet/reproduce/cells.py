@@ -80,7 +80,7 @@ def run_cell(experiment: Experiment, cell: Cell, effort: Effort, place: Path, up
         "versions": {"python": platform.python_version(), **versions()},
     }
     if cell.row not in experiment.untrained:
-        record |= {"demonstrations": effort.demonstrations, "minutes": effort.minutes}
+        record |= {"demonstrations": experiment.size(cell, effort), "minutes": effort.minutes}
     try:
         found = experiment.run(cell, effort, place, update)
         record["values"] = {column: value if value - value == 0 else None for column, value in found.items()}

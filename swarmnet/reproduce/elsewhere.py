@@ -28,7 +28,8 @@ def adopt(experiment: Experiment, document: Path, effort: Effort, folder: Path) 
     found = [(_cell(experiment, record, document), record) for record in _read(document, experiment.name)]
     for cell, record in found:
         had = {"profile": record["profile"]} | {name: record.get(name) for name in ("demonstrations", "minutes")}
-        same = {name: getattr(effort, name) for name in had if had[name] is not None}
+        same = {"profile": effort.profile, "demonstrations": experiment.size(cell, effort), "minutes": effort.minutes}
+        same = {name: value for name, value in same.items() if had[name] is not None}
         different = [f"{name} {had[name]!r} -> {value!r}" for name, value in same.items() if had[name] != value]
         if different:
             raise SwarmError(f"{document}: {cell} spent something else ({', '.join(different)}); give the same")

@@ -127,6 +127,8 @@ class Experiment:
     """Whether a (row, data set) makes sense; by default every one."""
     in_quick: Callable[[str, str], bool] = _everywhere
     """Whether profile quick does it: what it leaves out has no share of its minutes."""
+    size: Callable[["Cell", Effort], int] = lambda cell, effort: effort.demonstrations
+    """Demonstrations that a cell learns from."""
     unit: str = "normalized MSE"
     notes: str = ""
     """What a reader must know, printed below the table."""

@@ -157,6 +157,7 @@ FIGURE_3_6 = Experiment(
     rows=tuple(SIZES),
     data_sets=(DataSet("boids", tuple(map(_steps, HORIZONS))),),
     run=run_3_6,
+    size=lambda cell, effort: SIZES[cell.row],
     notes="A row is a number of demonstrations, all trained for the same minutes: quick goes to 5K, cpu to 20K.",
     figure=draw_3_6,
 )
@@ -166,6 +167,7 @@ FIGURE_3_7 = Experiment(
     rows=SWARMNETS,
     data_sets=(DataSet("boids", (*columns("boids"), *SAMPLES)),),
     run=run_3_7,
+    size=lambda cell, effort: 1000,
     leading=SWARMNETS[:1],
     notes=f"Trained on 1000 demonstrations in every profile. {SHOWN_NOTE}",
     figure=draw_3_7,

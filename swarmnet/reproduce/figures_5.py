@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from envs.collisions import NEAR_GOAL, collision_report
+from envs.collisions import NEAR_GOAL, collision_report, goal_distances
 from envs.config import RewardConfig, SimulateConfig
 from envs.estimates import Bootstrap
 from envs.storage import load, save
 from envs.swarm_env import SwarmEnv
-from envs.trajectories import AGENT, GOAL, Trajectories
+from envs.trajectories import AGENT, Trajectories
 from gnn.checkpoint import Model
 from gnn.config import TrainConfig
 from gnn.metrics import read_metrics
@@ -168,8 +168,7 @@ def measured(t: Trajectories) -> dict[str, float]:
     report, bootstrap, scenes = collision_report(t), Bootstrap(len(t), 0), np.ones(len(t))
     present = t.mask & (t.kind == AGENT)[:, None]
     events = ((t.agent_events + t.solid_events) * present)[:, 1:].sum(axis=(1, 2))
-    goal = t.position[np.arange(len(t)), :, np.argmax(t.kind == GOAL, axis=1)]
-    near = (np.linalg.norm(t.position - goal[:, :, None], axis=-1) <= NEAR_GOAL) & present
+    near = (goal_distances(t)[0] <= NEAR_GOAL) & present
     arrived = (near.any(axis=1) | ~present.any(axis=1)).all(axis=1)
     found = {
         TOUCHING: report["contact_steps_any"],
@@ -361,6 +360,7 @@ FIGURE_5_2 = Experiment(
         for data in IMITATION
     ),
     run=run_5_2,
+    size=lambda cell, effort: IMITATION[cell.data][0],
     leading=(IMITATED, SCRATCH),
     untrained=(EXPERT,),
     exists=lambda row, data: data == FEW or row not in (EXPERT, SCRATCH, *TERMINATIONS),
@@ -386,6 +386,7 @@ FIGURE_5_3 = Borrowing(
         for data in ZERO_SHOT
     ),
     run=run_5_3,
+    size=lambda cell, effort: IMITATION[LONGER][0],
     leading=(IMITATED, "mode 0"),
     untrained=(EXPERT,),
     unit="as named",
@@ -399,6 +400,7 @@ FIGURE_5_4 = Borrowing(
     rows=tuple(row for row in ROWS if row != SCRATCH),
     data_sets=(_columns(LONGER, *interval(TOUCHING), AWAY, AWAY_SHOWN),),
     run=run_5_4,
+    size=lambda cell, effort: IMITATION[LONGER][0],
     leading=(IMITATED,),
     untrained=(EXPERT,),
     unit="as named",

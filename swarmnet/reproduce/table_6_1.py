@@ -51,6 +51,8 @@ from swarmnet.results import write_whole
 LEARNED = SimulateConfig(preset="clear", mixed=True, num_obstacles=3)
 """Of the demonstrations: 1 to 5 agents, 0 to 3 obstacles."""
 DEMONSTRATIONS = 2000
+CROWD = 20
+"""Agents of the row that is repaired in crowds, at most."""
 TRAINING = TrainConfig(model="thesis-ch5-small", horizons=(1,), stage_steps=(9000,))
 THESIS = SimulateConfig(preset="clear", num_agents=5, num_obstacles=1)
 """Chapter 6's scenes."""
@@ -64,7 +66,9 @@ EDGES, NODES = ("edge/obstacle/layer2/*", "edge/agent/layer2/*"), ("node/*", "re
 IMITATED, REPLICA, READOUT, EDGE, EDGE_NODE = (
     "imitation", "thesis replica", "last layer, true disc", "edge functions", "edge + node",
 )  # fmt: skip
-LOOP, PENALTY, FILTER, BOTH = "counter-example loop", "Adam penalty", "filter", "repaired + filter"
+LOOP, CROWDS, PENALTY, FILTER, BOTH = (
+    "counter-example loop", "loop in crowds", "Adam penalty", "filter", "repaired + filter",
+)  # fmt: skip
 LOOPS: dict[str, LoopConfig] = {
     # As in chapter 6: 1000 states, obstacles alone, an L1 diamond, L1 deviation.
     REPLICA: LoopConfig(
@@ -74,10 +78,12 @@ LOOPS: dict[str, LoopConfig] = {
     EDGE: LoopConfig(method="relax", free=EDGES, polish=(), rounds=4),
     EDGE_NODE: LoopConfig(method="relax", free=(*EDGES, *NODES), polish=(), rounds=4),
     LOOP: LoopConfig(),
+    # The same in fewer scenes of up to 20 agents.
+    CROWDS: LoopConfig(scenes=128),
     # The same weights and gradient steps, all in the imitation policy's own states, towards its own actions.
     PENALTY: LoopConfig(rounds=1, targets="own", polish=(), descent=DescentConfig(steps=18_000)),
 }
-ROWS = (EXPERT, IMITATED, REPLICA, READOUT, EDGE, EDGE_NODE, LOOP, PENALTY, FILTER, BOTH)
+ROWS = (EXPERT, IMITATED, REPLICA, READOUT, EDGE, EDGE_NODE, LOOP, CROWDS, PENALTY, FILTER, BOTH)
 
 LEAST = 0.5
 """Contact steps of the imitation policy [%] below which no ratio to them counts."""
@@ -104,7 +110,12 @@ OTHERS = {
     "20 agents": replace(THESIS, num_agents=20),
     "3 obstacles": replace(THESIS, num_obstacles=3),
 }
-"""Scenes that no repair acted in."""
+"""Scenes that no repair acted in, but for those of the loop in crowds."""
+
+
+def learned_from(effort: Effort) -> int:
+    """Demonstrations of the imitation policy."""
+    return min(DEMONSTRATIONS, effort.demonstrations)
 
 
 Facts = dict[str, float]
@@ -128,8 +139,8 @@ class Policies:
     def imitated(self) -> Model:
         """The network that is repaired."""
         place, config = self.place(IMITATED), replace(TRAINING, seed=self.seed)
-        size = min(DEMONSTRATIONS, self.effort.demonstrations)
-        recorded = demonstrations(LEARNED, replace(self.effort, demonstrations=size), self.seed)
+        effort = replace(self.effort, demonstrations=learned_from(self.effort))
+        recorded = demonstrations(LEARNED, effort, self.seed)
         learning, validation = split(recorded, VALIDATION)
 
         def report(done: int, total: int, row: dict) -> None:
@@ -157,7 +168,10 @@ class Policies:
         if self.effort.profile == "quick":
             how = replace(how, rounds=min(how.rounds, 2), scenes=128, descent=replace(how.descent, steps=1000))
         # Ours acts in the demonstrations' fuller scenes, the methods of one step in the thesis's.
-        world = THESIS.world() if row in (REPLICA, READOUT) else mixed(LEARNED.world(), min_agents=3, min_obstacles=1)
+        world = THESIS.world()
+        if row not in (REPLICA, READOUT):
+            fuller = replace(LEARNED, num_agents=CROWD) if row == CROWDS else LEARNED
+            world = mixed(fuller.world(), min_agents=3, min_obstacles=1)
         perform = make_perform(model, world, scenes=how.scenes, steps=how.steps, seed=SCENES + how.seed)
 
         def report(done: int, total: int, found: dict) -> None:
@@ -339,20 +353,21 @@ TABLE_6_1 = Experiment(
         *(DataSet(name, tuple(f"{name}: {column}" for column in ELSEWHERE)) for name in OTHERS),
     ),
     run=run_6_1,
+    size=lambda cell, effort: learned_from(effort),
     references={
         (row, column): x for row, figures in _THESIS.items() for column, x in zip(THESIS_COLUMNS, figures, strict=True)
     },
     leading=(IMITATED, LOOP),
     untrained=(EXPERT,),
     exists=lambda row, data: (
-        data == "thesis" or row in (IMITATED, LOOP, *(() if data == CERTIFIED else (EXPERT, FILTER, BOTH)))
+        data == "thesis" or row in (IMITATED, LOOP, *(() if data == CERTIFIED else (EXPERT, CROWDS, FILTER, BOTH)))
     ),
     unit="as named",
     notes=(
         "Training and repair have their own lengths, whatever the minutes of the profile. "
         f"Networks of preset {TRAINING.model}, imitated from {DEMONSTRATIONS} runs of 1 to 5 agents, 0 to 3 obstacles; "
-        "rounds of repair act in such scenes with at least 3 agents and 1 obstacle, the methods of one step in the "
-        "thesis's; "
+        "rounds of repair act in such scenes with at least 3 agents and 1 obstacle (`loop in crowds`: with 3 to "
+        f"{CROWD} agents), the methods of one step in the thesis's; "
         f"judged in {TESTED} unseen scenes of 5 agents and 1 obstacle, {STEPS} control steps (a quarter of them "
         "elsewhere). "
         "The thesis's columns count obstacles alone, in closed loop, in the test scenes and in 100 train scenes, from "
