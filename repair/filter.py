@@ -17,6 +17,8 @@ from repair.network import Situations
 
 TIGHTEST = 8
 """Conditions of an agent whose lines are tried, those with the least slack; all of them are checked."""
+MORE = 3
+"""Times that the lines are chosen anew where there are more conditions."""
 TOLERANCE = 1e-4
 """By how much an action may violate a condition and still count as allowed [m/s^2]."""
 
@@ -29,20 +31,21 @@ def nearest_allowed(
     A quadratic program in two variables, solved exactly: its solution is the action itself, its projection on one line
     or on the circle, or where two of these meet; all are tried at once. Where nothing is allowed: the one of them that
     violates the worst condition least. Of more than `TIGHTEST` conditions, those that are tightest at the action give
-    the lines, and then those that are tightest there or where that led to: nearly always exact, and what counts as
-    allowed satisfies all.
+    the lines, and then those that are tightest there or where that led to: exact where no more than that many
+    are missed by the action or nearer to it than what is allowed; what counts as allowed always satisfies all.
     """
     xp = action.__array_namespace__()
     action = _within(xp, action, limit)
     tight = xp.sum(planes.normal * action[:, None], axis=-1) - planes.offset
     found, possible = _among(action, planes, tight, limit)
-    if planes.offset.shape[1] <= TIGHTEST:
-        return found, possible
-    there = xp.sum(planes.normal * found[:, None], axis=-1) - planes.offset
-    other, fits = _among(action, planes, xp.minimum(tight, there), limit)
-    nearer = xp.sum((other - action) ** 2, axis=-1) < xp.sum((found - action) ** 2, axis=-1)
-    better = fits & (nearer | ~possible)
-    return xp.where(better[:, None], other, found), possible | fits
+    at = found
+    for _ in range(MORE if planes.offset.shape[1] > TIGHTEST else 0):
+        tight = xp.minimum(tight, xp.sum(planes.normal * at[:, None], axis=-1) - planes.offset)
+        at, fits = _among(action, planes, tight, limit)
+        nearer = xp.sum((at - action) ** 2, axis=-1) < xp.sum((found - action) ** 2, axis=-1)
+        better = fits & (nearer | ~possible)
+        found, possible = xp.where(better[:, None], at, found), possible | fits
+    return found, possible
 
 
 def _among(

@@ -283,7 +283,7 @@ def _check_model(model: Model, stage: Stage) -> None:
         )
 
 
-def scenes_seen(model: Model) -> set[tuple[int | None, str]]:
+def scenes_seen(model: Model) -> set[tuple[int, str]]:
     """Seed and preset of the scenes that a model has learned in: of its data, of PPO, of rounds of repair."""
     simulated = [part["simulate"] for part in model.trained_on if part.get("simulate")]
     seeds, about = [], model.about
@@ -291,9 +291,8 @@ def scenes_seen(model: Model) -> set[tuple[int | None, str]]:
         seeds += [about.get("rl", {}).get("seed"), about.get("repair", {}).get("scene_seed")]
         about = about.get("initial")
     presets = {one["preset"] for one in simulated}
-    return {(one["seed"], one["preset"]) for one in simulated} | {
-        (seed, preset) for seed in seeds for preset in presets
-    }
+    acted = {(seed, preset) for seed in seeds if seed is not None for preset in presets}
+    return acted | {(one["seed"], one["preset"]) for one in simulated}
 
 
 def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, seed: int) -> None:

@@ -17,7 +17,7 @@ from gnn.checkpoint import Checkpoints, describe
 from gnn.config import ModelConfig
 from gnn.decode import Integrator
 from gnn.features import Scales
-from repair.certify import Effort, _judged, _needs, certify
+from repair.certify import Effort, _Found, _judged, _needs, certify
 from repair.constraints.barrier import Barrier
 from repair.encounters import encounters
 from repair.errors import NotEncodable, RepairError
@@ -374,6 +374,24 @@ def test_the_command_writes_a_certificate_and_counter_examples(tmp_path: Path, c
     told = capsys.readouterr().out
     assert "unavoidable" in told
     assert "less outward than it has to" in told
+
+
+def test_the_worst_is_kept_and_what_is_not_kept_counts_too():
+    few, many = (_found(most) for most in (0, 3))
+    assert (len(few), few.worst) == (len(many), many.worst) == (40, -7.0)
+    assert len(few.taken(1)[1]) == 0
+    points, slack = many.taken(1)
+    assert len(slack) == 3
+    assert (slack[0], points[0, 0]) == (-7.0, 13.0)
+
+
+def _found(most: int) -> _Found:
+    """40 states that violate by 1, but for number 13, by 7; and one that does not."""
+    found = _Found(most)
+    slack = np.full(41, -1.0)
+    slack[13], slack[40] = -7.0, 0.5
+    found.add(np.arange(41.0)[:, None], slack)
+    return found
 
 
 def _on_device(tree):

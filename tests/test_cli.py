@@ -192,7 +192,7 @@ def test_simulate_train_evaluate_in_a_row(tmp_path: Path, monkeypatch, capsys):
     train += ("--chunk", "2", "--batch", "4", "--learning-rate", "0.0001")
     assert main(train) == 0
     assert "r: thesis-ch5 trained for 4 steps on 5 scenes" in capsys.readouterr().out
-    assert "training data's own" in fails(capsys, "evaluate", "r", "--seed", "0", "--scenes", "2")
+    assert "scenes that the model learned in" in fails(capsys, "evaluate", "r", "--seed", "0", "--scenes", "2")
     assert "train differ" in fails(capsys, *train, "--seed", "5")
     assert main(("evaluate", "r", "--scenes", "3", "--steps", "12", "--videos", "0", "--json", "e.json")) == 0
     out = capsys.readouterr().out

@@ -1,6 +1,7 @@
 """The collision report against figures computed by hand, and its intervals."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -145,6 +146,18 @@ def test_agents_that_leave_are_counted_while_they_are_there():
     mask[:, 3:, 3] = False  # agent 3 is there for 2 of 4 steps
     t = still_life(mask=mask, **contacts(agent_contact=[(0, 1, 3, 1), (1, 4, 3, 1)]))
     assert values(t)["agent_contact_steps_any"] == 1 / (2 * (4 + 2))
+
+
+def test_scenes_and_rows_without_a_goal_count_for_no_goal_figure():
+    """Scene 0 as by hand, scene 1 without its goal: the figures are those of scene 0."""
+    t = still_life()
+    alone, mask = collision_report(t.take([0])), t.mask.copy()
+    mask[1, :, 0] = False
+    both = collision_report(replace(t, mask=mask))
+    for name in ("final_goal_distance", "reached_goal", "agent_contact_steps_en_route"):
+        assert both[name].value == alone[name].value, name
+    mask[0, -1, 0] = False
+    assert math.isnan(collision_report(replace(t, mask=mask))["final_goal_distance"].value)
 
 
 def test_a_world_without_a_goal_has_no_goal_figures():

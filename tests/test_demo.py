@@ -9,9 +9,11 @@ import pytest
 from learning import quick_training
 
 import swarmnet.commands.demo
+from envs.config import SimulateConfig
 from gnn.config import TrainConfig
 from gnn.metrics import read_metrics
 from swarmnet.cli import main
+from swarmnet.commands.demo import _judged
 
 DEMO = (
     "demo", "--name", "small", "--scenes", "12", "--test-scenes", "4", "--scale", "0.2", "--videos", "1",
@@ -68,6 +70,24 @@ def test_a_second_call_keeps_what_is_done_and_says_the_same(demo: Path, capsys):
     assert "4 unseen scenes, 50 control steps of 0.3 s" in out
     for words in ("final goal distance", "steps with a contact", "normalized prediction error"):
         assert words in out
+
+
+@pytest.mark.parametrize("wrong", [("--scenes", "0"), ("--test-scenes", "0"), ("--scale", "nan")])
+def test_bad_input_leaves_no_folder(wrong: tuple[str, str], tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main((*DEMO, *wrong)) == 2
+    assert "swarmnet: " in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_another_command_judged_is_not_taken_for_the_demo_s(demo: Path, tmp_path: Path):
+    judged, unseen = json.loads((demo / "evaluation.json").read_text()), SimulateConfig(scenes=4, seed=1_000_000)
+    name, path = "swarmnet thesis-ch5", tmp_path / "evaluation.json"
+    assert not _judged(path, unseen, name)
+    other = {"swarmnet thesis-ch5, 3 nearest": 0, "expert": 0}
+    for change, own in (({}, True), ({"seed": 7}, False), ({"scenes": 5}, False), ({"collisions": other}, False)):
+        path.write_text(json.dumps(judged | change))
+        assert _judged(path, unseen, name) == own, change
 
 
 @pytest.mark.parametrize("change", [("--seed", "1"), ("--scenes", "13"), ("--model", "best"), ("--scale", "0.5")])

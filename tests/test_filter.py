@@ -17,7 +17,7 @@ from repair.constraints.constraint import HalfPlanes
 from repair.constraints.disc import Disc
 from repair.constraints.registry import make_constraint
 from repair.encounters import encounters
-from repair.filter import TOLERANCE, make_filtered, nearest_allowed, safe_actions
+from repair.filter import TIGHTEST, TOLERANCE, make_filtered, nearest_allowed, safe_actions
 from repair.network import situations_of_state
 from swarm_mjcf.spec import SceneSpec
 
@@ -76,6 +76,35 @@ def test_what_is_allowed_stays_and_what_helps_is_taken():
 
 def planes_of(planes: HalfPlanes, rows: np.ndarray) -> HalfPlanes:
     return HalfPlanes(normal=planes.normal[rows], offset=planes.offset[rows])
+
+
+@pytest.mark.parametrize(("low", "high"), [(-3, 0), (-20, 0), (-20, 2)])
+def test_of_many_conditions_all_are_checked(low, high):
+    """24 half-planes: what counts as allowed satisfies all of them; where no more than 8 are missed by the action or
+    nearer to it than what is allowed, it is the nearest."""
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, (500, 24))
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    planes = HalfPlanes(normal=normal, offset=rng.uniform(low, high, angle.shape))
+    wanted = rng.normal(0, 9, (500, 2))
+    found, possible = map(np.asarray, nearest_allowed(wanted, planes, LIMIT))
+    assert (violation(found, planes)[possible] <= TOLERANCE).all()
+    assert possible.mean() > 0.4
+    u, given = cp.Variable(2), wanted * np.minimum(1, LIMIT / np.linalg.norm(wanted, axis=1))[:, None]
+    checked = 0
+    for row in range(40):
+        constraints = [normal[row] @ u >= planes.offset[row], cp.norm(u) <= LIMIT]
+        problem = cp.Problem(cp.Minimize(cp.sum_squares(u - given[row])), constraints)
+        problem.solve(solver=cp.CLARABEL)
+        allowed = problem.status in ("optimal", "optimal_inaccurate")
+        assert allowed or not possible[row]
+        if not allowed or u.value is None:
+            continue
+        tight = normal[row] @ given[row] - planes.offset[row]
+        if (tight < np.linalg.norm(u.value - given[row]) + 1e-3).sum() <= TIGHTEST:
+            checked += 1
+            np.testing.assert_allclose(found[row], u.value, atol=2e-3)
+    assert checked > 5 or low == -3
 
 
 def test_absent_conditions_and_no_limit():
@@ -164,6 +193,20 @@ def test_nobody_touches_in_physics():
     here = np.asarray(start.agent_present)
     assert recording.position[:, -1, 0, 0].min() > -15  # it goes on, where it may
     np.testing.assert_array_equal(recording.position[:, -1][~here], recording.position[:, 0][~here])
+
+
+def test_chasers_are_kept_from_everybody_and_not_from_their_target_alone():
+    """The second agent flies at the third, the target of both is the first."""
+    state = scene_state(
+        SPEC,
+        np.array([[[0.0, 40.0], [4.0, 0], [0, 0]]]),
+        np.array([[[0.0, 0], [-8.0, 0], [0, 0]]]),
+        obstacle=np.full((1, 2, 2), -60.0),
+    )
+    chased = replace(state, target=np.array([[[1], [0], [0]]], np.int32))
+    keep = make_filtered(lambda *_: jnp.zeros((1, 3, 2)), Barrier(kinematics=SPEC), SPEC, SPEC)
+    np.testing.assert_array_equal(keep(chased, None), keep(state, None))
+    assert float(jnp.abs(keep(chased, None)[0, 1]).max()) > 1
 
 
 def test_absent_agents_keep_their_action():

@@ -136,6 +136,17 @@ def frames(path: Path, rows: np.ndarray = WALK) -> Path:
     return parquet(path, frame=frame, id=id.astype(int), x=x, y=y)
 
 
+def damaged_matlab(folder: Path) -> Path:
+    """Compressed, with bytes flipped in the middle."""
+    path = folder / "a.mat"
+    savemat(path, {"tracks": np.random.default_rng(0).normal(size=(200, 4))}, do_compression=True)
+    whole = bytearray(path.read_bytes())
+    for at in range(len(whole) // 2, len(whole) // 2 + 40):
+        whole[at] ^= 0xFF
+    path.write_bytes(bytes(whole))
+    return path
+
+
 MATLAB = ImportConfig(unit="m", fps=FPS, columns=("frame=1", "id=2", "x=3", "y=4"))
 WRITERS = {
     "csv": (csv, "w.csv", METRES),
@@ -285,6 +296,13 @@ def test_a_third_coordinate_that_varies_is_said_and_one_that_is_no_number_refuse
         read(*written(("1.7", "nan", "3.4")))
 
 
+@pytest.mark.parametrize("header", ["# id frame x [cm] y [m] z [m]", "# id frame x[cm] y(m) z (m)"])
+def test_units_in_brackets_are_no_columns(header: str, tmp_path: Path):
+    (plain,) = read(juelich(tmp_path / "a.txt"), PLAIN)
+    (bracketed,) = read(juelich(tmp_path / "b.txt", header=f"# framerate: 5 fps\n{header}\n"), PLAIN)
+    np.testing.assert_array_equal(bracketed.position, plain.position)
+
+
 def test_two_files_of_different_declared_units(tmp_path: Path):
     first = juelich(tmp_path / "a.txt", header="# framerate: 5\n# id frame x/cm y/m\n")
     second = jupedsim(tmp_path / "b.sqlite")
@@ -398,6 +416,27 @@ BROKEN = {
         "says 25 frames per second, --fps says 10",
     ),
     "juelich no x": (text("a.txt", "# framerate: 25\n# id frame y/m\n1 0 1 1\n"), PLAIN, "header names no column x"),
+    "juelich more names than columns": (
+        text("a.txt", "# framerate: 25\n# id frame x/m y/m z/m\n1 0 1 1\n"),
+        PLAIN,
+        "rows have 4 columns, its header names 5",
+    ),
+    "csv a column twice": (text("a.csv", "t,id,x,y,x\n0,1,2,3,4\n"), METRES, "has the column 'x' more than once"),
+    "csv nobody": (text("a.csv", "t,id,x,y\n0,1,2,3\n1,,2,3\n"), METRES, "1 rows have no id"),
+    "trajnet something else": (text("a.ndjson", '{"scene": {"fps": 2}}\n{"foo": 1}\n'), PLAIN, "line 2 is neither"),
+    "trajnet a list": (text("a.ndjson", "[1, 2]\n"), PLAIN, "line 1 is neither"),
+    "matlab damaged": (damaged_matlab, PLAIN, "is no whole MATLAB v5 file"),
+    "matlab nobody": (
+        lambda d: matlab(d / "a.mat", np.array([[0, np.nan, 1, 1], [1, 2, 1, 1]])),
+        replace(METRES, columns=("t=1", "id=2", "x=3", "y=4")),
+        "1 rows have no id",
+    ),
+    "published cut off": (
+        text("a_timeseries.npy", b"\x93NUMPY\x01\x00\x10\x00{'descr': '<f4', "),
+        PLAIN,
+        "is no array of numbers",
+    ),
+    "published an archive": (text("a_timeseries.npy", b"PK\x03\x04 nothing"), PLAIN, "is no array of numbers"),
     "juelich columns change": (
         text("a.txt", "# framerate: 25\n# id frame x/m y/m z/m\n1 0 1 1 1\n1 1 1 1\n"),
         PLAIN,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from learning import quick_training
+from learning import quick_training, tiny
 
 from envs.collective import UNITS
 from envs.collisions import collision_report
@@ -18,8 +18,12 @@ from envs.estimates import Estimate
 from envs.replay import replay
 from envs.simulate import simulate_in_memory
 from envs.storage import load, save
+from gnn.checkpoint import Model
+from gnn.decode import Integrator
+from gnn.features import Scales
 from swarmnet.cli import main
 from swarmnet.closed_loop import Stage, roll_out
+from swarmnet.judge import scenes_seen
 from swarmnet.policies import find_policy
 
 SMALL = ("--scenes", "6", "--steps", "10", "--videos", "0", "--engine", "native")
@@ -210,6 +214,15 @@ def test_what_cannot_be_judged_is_one_line(arguments: tuple[str, ...], said: str
     (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("swarmnet: "))
     assert said in line
     assert not Path("new").exists() or not list(Path("new").rglob("*.*"))
+
+
+def test_scenes_of_ppo_and_of_repair_are_not_unseen():
+    data = {"mixed": [{"simulate": {"seed": 3, "preset": "clear"}}, {"recorded": "elsewhere"}]}
+    about = {"data": data, "repair": {"scene_seed": 2_000_005}, "initial": {"data": data, "rl": {"seed": 8}}}
+    motion = Integrator(dt=0.3, substeps=30, max_speed=10.0, max_acceleration=10.0)
+    model = Model(tiny("best"), Scales.ones(), motion, {}, about)
+    assert scenes_seen(model) == {(3, "clear"), (8, "clear"), (2_000_005, "clear")}
+    assert scenes_seen(replace(model, about={"data": data})) == {(3, "clear")}
 
 
 def test_every_name_is_defined(there: Path):

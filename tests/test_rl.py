@@ -13,7 +13,7 @@ import pytest
 from learning import quick_compiles, tiny
 from probes import Plain, Probe, probe_actor
 
-from envs.config import RewardConfig, make_world, mixed
+from envs.config import RewardConfig, SimulateConfig, make_world, mixed
 from envs.swarm_env import SwarmEnv, scene_keys
 from gnn.checkpoint import CheckpointError, Model, load_model
 from gnn.decode import Integrator, make_policy, network_init
@@ -108,6 +108,30 @@ def test_contacts_end_episodes_in_the_first_iterations_alone():
     assert np.asarray(later.measures["contact_events"]).any()
     # All started together, and nothing else ends an episode before the horizon.
     np.testing.assert_array_equal(later.ended, np.broadcast_to(np.arange(6)[:, None] == 5, (6, 6)))
+
+
+def test_worlds_without_a_goal_contacts_or_a_limit():
+    """No goal, nothing paid for one; a price on contacts that are off, or an endless exploration, is refused."""
+
+    def of(preset, reward=None):
+        world = SimulateConfig(preset=preset, num_agents=2).world()
+        return SwarmTask(SwarmEnv(world.scene, spawn=world.spawn, engine="native"), reward)
+
+    free = RewardConfig(collision=0.0)
+    chaser = of("chaser", free)
+    world, _ = chaser.start(scene_keys(0, np.arange(3)))
+    terms = chaser.step(world, jnp.zeros((3, 2, 2))).measures
+    assert not np.asarray(terms["reward_goal"]).any()
+    assert np.asarray(of("clear").step(*started(of("clear"))).measures["reward_goal"]).any()
+    with pytest.raises(SpecError, match=r"contacts.*False.*on, as in preset clear"):
+        of("published")
+    with pytest.raises(SpecError, match=r"max_acceleration.*inf"):
+        of("vicsek", free)
+
+
+def started(task):
+    world, _ = task.start(scene_keys(0, np.arange(3)))
+    return world, jnp.zeros((3, 2, 2))
 
 
 def test_a_model_that_does_not_steer_is_refused():

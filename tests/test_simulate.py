@@ -53,10 +53,12 @@ def test_a_file_holds_what_was_asked_for_and_where_it_comes_from(tmp_path: Path,
 def test_a_file_of_the_same_settings_is_kept(tmp_path: Path, expected: Trajectories):
     path = tmp_path / "swarm.h5"
     save(path, expected)
+    (tmp_path / "swarm.h5.parts").mkdir()  # of a call that was killed when the file was whole
     written = path.stat()
     header = simulate(replace(CONFIG, chunk=5, threads=1), path, progress=lambda *_: pytest.fail("it ran again"))
     assert header.scenes == SCENES
     assert (path.stat().st_mtime_ns, path.stat().st_ino) == (written.st_mtime_ns, written.st_ino)
+    assert not (tmp_path / "swarm.h5.parts").exists()
 
 
 @pytest.mark.parametrize("change", [{"seed": 5}, {"scenes": 24}, {"steps": 7}, {"preset": "clear"}, {"mixed": True}])
@@ -250,6 +252,7 @@ def test_the_fingerprint_is_of_the_settings_that_matter():
     ("field", "value"),
     [(field, 0) for field in ("scenes", "steps", "num_agents", "chunk")]
     + [(field, -1) for field in ("num_obstacles", "seed", "threads")]
+    + [("seed", 2**32)]
     + [("preset", "chaos"), ("start", "nowhere"), ("dt", 0.0), ("dt", -0.3), ("obstacle_speed", -1.0), ("nearest", 0)],
 )
 def test_settings_that_make_no_sense_are_refused(field: str, value: object):

@@ -45,12 +45,12 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
 
 def _columns(path: Path, comments: list[str], width: int) -> tuple[dict[str, int], dict[str, str]]:
     """Where each column stands, and its unit where the header says one (x/m, x[m], x [m], x (m)); id frame x y z
-    without a header. Raises ImportFailed for a header of more or fewer columns than the rows have."""
+    without a header. Raises ImportFailed for a header of more columns than the rows have."""
     for comment in reversed(comments):
         words = [word.partition("/") for word in _BRACKETED.sub(r"/\1", comment).split()]
         names = [_NAMES.get(name.lower(), "") for name, _, _ in words]
         if {"id", "frame", "x", "y"} <= set(names):
-            if len(names) != width:
+            if len(names) > width:
                 raise ImportFailed(
                     f"{path}: rows have {width} columns, its header names {len(names)}: {comment.strip()}"
                 )

@@ -44,6 +44,8 @@ def run(config: Repair) -> int:
     world, how = simulated.world(), part_of(LoopConfig, config)
     least = {name: value for name in ("min_agents", "min_obstacles") if (value := getattr(config, name)) is not None}
     world = replace(world, spawn=replace(world.spawn, **least))
+    if world.spawn.targets:
+        raise SpecError("init", str(config.init), "a model of a world without targets: of others, chasers hear nothing")
     examples = concatenate_fitted([unpacked(path) for path in config.examples])
     # The noise of the training world is on what it perceives and does here too; what is repaired is what it decides
     # in the states that it comes to.
