@@ -240,7 +240,7 @@ def repair(
         kept = work.load(number) if number < config.rounds else None
         if kept is not None:
             params = kept
-            began = time.perf_counter() - work.history[-1]["through"]  # seconds of the rounds that are done count
+            began = time.perf_counter() - work.history[-1].get("through", 0.0)  # the seconds of what is done count too
             tell(number + 1, config.rounds + 1, work.history[-1])
             continue
         situations, found, row = work.judged(params, number)
