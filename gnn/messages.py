@@ -1,5 +1,6 @@
 """What goes on inside a SwarmNet: its messages, and the acceleration that comes out."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -30,7 +31,8 @@ def swarmnet_config(model: Model) -> ModelConfig:
 
 def messages(model: Model, history: Float[Array, "B W V 4"], graph: Graph) -> dict[str, Float[Array, "B N M F"]]:
     """Outputs of the edge functions by type, (receiver, sender); 0 where the edge is off."""
-    _, state = SwarmNet(swarmnet_config(model), model.scales).apply(
+    # Of all pairs, also where the network itself hears of the nearest alone: the weights are the same.
+    _, state = SwarmNet(replace(swarmnet_config(model), nearest=None), model.scales).apply(
         {"params": model.params},
         jnp.asarray(history),
         graph,

@@ -1,5 +1,7 @@
 """What a model has seen: agents at a time, speeds, distances to the nearest other. Plain figures for its checkpoint."""
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
@@ -30,6 +32,8 @@ def samples_of(trajectories: Trajectories) -> dict[str, Float[np.ndarray, " n"]]
     each to the nearest other agent [m]. No random draw: every so many rows are looked at."""
     scenes, rows, nodes = trajectories.mask.shape
     every = max(1, scenes * rows * nodes // _CELLS)
+    while math.gcd(every, rows) > 1:  # or the same rows of all scenes would be looked at
+        every += 1
     scene, row = np.divmod(np.arange(0, scenes * rows, every), rows)
     there = trajectories.mask[scene, row] & (trajectories.kind[scene] == AGENT)
     position, velocity = trajectories.position[scene, row], trajectories.velocity[scene, row]

@@ -199,14 +199,14 @@ def train_prepared(prepared: Prepared, folder: str | Path, *, progress: Progress
             horizon = config.horizons[stage]
             started = time.monotonic()
             new, loss, norm = prepared.run_chunk(state, prepared.data, config.steps, horizon=horizon)
-            loss = float(loss)
-            if not np.isfinite(loss):
+            loss, norm = float(loss), float(norm)
+            if not np.isfinite(loss + norm):
                 raise TrainError(
-                    f"{folder}: the loss is {loss} after step {done}; the checkpoint of step {saved_step} stays. Take "
-                    f"a smaller learning_rate than {config.learning_rate}"
+                    f"{folder}: the loss is {loss} and its gradient {norm} after step {done}; the checkpoint of step "
+                    f"{saved_step} stays. Take a smaller learning_rate than {config.learning_rate}"
                 )
             state, done = new, done + config.chunk
-            row = {"stage": stage, "horizon": horizon, "loss": loss, "gradient_norm": float(norm)}
+            row = {"stage": stage, "horizon": horizon, "loss": loss, "gradient_norm": norm}
             row["validation_error"] = float(prepared.measure(state["params"]))
             row["steps_per_second"] = config.chunk / (time.monotonic() - started)
             metrics.write(done, **row)

@@ -1,7 +1,7 @@
 """SceneSpec -> MJCF -> MjSpec -> model: spheres on two slide joints, mocap obstacles, sensors that tell contacts apart.
 
 The scene is written as MJCF text and parsed by MuJoCo: 2.5 times faster than adding the elements one by one through the
-`MjSpec` bindings (`benchmarks/run.py build`), and the text is what MuJoCo users read.
+`MjSpec` bindings, and the text is what MuJoCo users read.
 """
 
 import colorsys

@@ -301,6 +301,10 @@ class Probe:
     """Figure 5.1: virtual walls act in every column, not only where the obstacle rule is on."""
 
 
+UNSEEN = 1_000_000
+"""Seeds from here on are those of scenes to test on."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
     """Make a table or figure of the thesis anew: simulate, train, test, and set its figures beside ours.
@@ -344,7 +348,7 @@ class Reproduce:
     def __post_init__(self) -> None:
         if self.minutes is not None and not 0 < self.minutes < float("inf"):
             raise SpecError("minutes", self.minutes, "a finite number above 0 [min]")
-        if any(seed < 0 for seed in self.seeds):
-            raise SpecError("seeds", self.seeds, "at least 0 each")
+        if any(not 0 <= seed < UNSEEN for seed in self.seeds):
+            raise SpecError("seeds", self.seeds, f"in 0..{UNSEEN - 1} each: larger ones are of unseen scenes")
         if self.jobs is not None and self.jobs < 1:
             raise SpecError("jobs", self.jobs, "at least 1")

@@ -4,7 +4,7 @@ a model's prediction alone, on recorded trajectories."""
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,17 +20,19 @@ from envs.estimates import Estimate
 from envs.experts.registry import make_expert
 from envs.plain import from_plain, plain
 from envs.rollout import make_rollout
+from envs.state import make_state
 from envs.storage import save
 from envs.swarm_env import SwarmEnv, scene_keys
 from envs.trajectories import Trajectories, from_recording, versions
 from gnn.checkpoint import Model
 from gnn.evaluate import PredictionError
 from gnn.forecast import forecast
+from gnn.graph import graph_of_state
 from swarm_mjcf.errors import SwarmError
 from swarmnet.closed_loop import Stage, replayed, roll_out
 from swarmnet.out_of_range import out_of_range
 from swarmnet.policies import EXPERT, Source, find_policy
-from swarmnet.recorded import holdout_of, predictions, sample_windows
+from swarmnet.recorded import check_nodes, holdout_of, predictions, sample_windows
 from swarmnet.results import commit, hardware, write_whole
 from swarmnet.selection import difference
 
@@ -66,6 +68,8 @@ class Judgement:
     """Whether contacts come from positions, because policy or reference is a recording."""
     data: str | None = None
     """File of the recorded trajectories that were predicted, where nothing was steered."""
+    asked: dict[str, Any] = field(default_factory=dict)
+    """Options of `swarmnet evaluate` beside those above that were not the usual ones."""
     said: tuple[str, ...] = ()
     """Warnings: what is out of the range of a model's training data."""
     dt: float
@@ -81,7 +85,7 @@ class Judgement:
         return _finite(
             {
                 "policy": self.policy, "reference": self.reference, "given": self.given, "data": self.data,
-                "nearest": self.nearest, "radius": self.radius,
+                "nearest": self.nearest, "radius": self.radius, "asked": self.asked,
                 "preset": self.preset, "engine": self.engine, "hardware": hardware(), "versions": versions(),
                 "commit": commit(), "said": self.said,
                 "prediction": {
@@ -152,6 +156,8 @@ def judge_policy(
       SwarmError: the scenes are those of a model's training data, its dt is not the world's, recordings do not hold the
         same number of scenes, rows and nodes, or a policy cannot be used.
     """
+    if reference is None and source.model is not None and not source.acts:
+        raise SwarmError(f"{source.given}: predicts changes of state, so there is nothing to judge without a reference")
     for one in (source, reference):
         if one is not None and one.model is not None:
             _check_model(one.model, stage)
@@ -281,6 +287,14 @@ def _check_model(model: Model, stage: Stage) -> None:
             f"the model was trained at dt {model.integrator.dt} s with {model.integrator.substeps} substeps, this "
             f"world has {scene.dt} s with {scene.substeps}"
         )
+    state = stage.starts or make_state(
+        position=np.zeros((1, scene.num_agents, 2), np.float32),
+        velocity=np.zeros((1, scene.num_agents, 2), np.float32),
+        goal=np.zeros((1, 2), np.float32),
+        obstacle=np.zeros((1, scene.num_obstacles, 2), np.float32),
+    )
+    nodes, graph = graph_of_state(jax.tree.map(lambda x: x[:1], state), goal=scene.goal)
+    check_nodes(model, np.repeat(nodes[:, None], model.config.window, axis=1), graph, "this world")
 
 
 def scenes_seen(model: Model) -> set[tuple[int, str]]:
@@ -305,7 +319,7 @@ def sweep(world: World, model: Model, folder: Path, *, engine: str, steps: int, 
     env = SwarmEnv(world.scene, engine=engine, spawn=world.spawn, horizon=steps)
     keys = scene_keys(seed, np.zeros(4, np.int64))
     start = env.reset(keys)
-    goal, agents = start.goal[0], start.position[0].mean(axis=0)
+    goal, agents = start.goal[0], start.position[0][np.asarray(start.agent_present[0])].mean(axis=0)
     across = jnp.stack([-(agents - goal)[1], (agents - goal)[0]]) / jnp.linalg.norm(agents - goal)
     shift = world.scene.obstacle_radius * jnp.asarray([-1.5, -0.5, 0.5, 1.5])
     places = (goal + agents) / 2 + shift[:, None] * across

@@ -6,11 +6,14 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from envs.record import Array
 from envs.storage import load, save
 from envs.trajectories import AGENT, Trajectories, concatenate
 from gnn.checkpoint import Model
 from gnn.evaluate import HORIZONS, PredictionError, constant_velocity, persistence, prediction_error
+from gnn.graph import Graph
 from gnn.windows import Dataset, check_rows, windows
 from swarm_mjcf.errors import SwarmError
 from swarmnet.out_of_range import out_of_range
@@ -68,12 +71,17 @@ def _check_nodes(model: Model, trajectories: Trajectories, data: Path) -> None:
     history, _, _, graph = windows(
         Dataset.of(one), zero, zero, window=model.config.window, horizon=1, counts=trajectories.counts
     )
+    check_nodes(model, history, graph, str(data))
+
+
+def check_nodes(model: Model, history: Float[Array, "B W V 4"], graph: Graph, where: str) -> None:
+    """Raises PolicyError where the model's weights are for other kinds of nodes than those of `where`."""
     try:
         jax.eval_shape(lambda p: model.predict(p, history, graph, horizon=1), model.params)
     except Exception as error:
-        goals, obstacles, agents = trajectories.counts
+        goals, obstacles, agents = graph.counts
         raise PolicyError(
-            f"{data}: has up to {goals} goals, {obstacles} obstacles and {agents} agents, and the model learned from "
+            f"{where}: has up to {goals} goals, {obstacles} obstacles and {agents} agents, and the model learned from "
             f"other kinds of nodes ({str(error).strip().splitlines()[0]})"
         ) from error
 
@@ -120,8 +128,10 @@ def sample_windows(model: Model, trajectories: Trajectories, folder: Path) -> No
         window=window, horizon=horizon, counts=truth.counts,
     )  # fmt: skip
     future = jax.device_get(jax.jit(lambda p: model.predict(p, history, graph, horizon=horizon))(model.params))
-    there = np.concatenate([truth.mask[:, :window], np.asarray(mask)], axis=1)
-    states = np.where(there[..., None], np.concatenate([history, future], axis=1), 0).astype(np.float32)
+    states = np.concatenate([history, future], axis=1)
+    sound = np.logical_and.accumulate(np.isfinite(states).all(axis=-1), axis=1)  # not after an overflow
+    there = np.concatenate([truth.mask[:, :window], np.asarray(mask)], axis=1) & sound
+    states = np.where(there[..., None], states, 0).astype(np.float32)
     predicted = replace(
         truth,
         position=states[..., :2],

@@ -297,8 +297,13 @@ def _repair_command(facts: Facts, begun: Path) -> str:
     if told.exists():
         given |= {name: value for name, value in json.loads(told.read_text()).items() if name not in ("settings", "of")}
     for name, value in given.items():
-        if value != usual.get(name) and value not in (None, []):
-            words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
+        if value == usual.get(name) or value is None:
+            continue
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif value != [] or usual.get(name):  # an empty list where the usual one is not: the flag alone
+            words += [f"--{flag}", *map(str, value if isinstance(value, list) else [value])]
     return shlex.join(words)
 
 

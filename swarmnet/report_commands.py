@@ -24,7 +24,10 @@ def commands(facts: Facts) -> list[tuple[str, str]]:
         train: dict[str, Any] = about["train"] | {"run": run}
         if 0 < kept < all_scenes and kept != max(1, round(0.05 * all_scenes)):
             train["validation"] = kept / all_scenes
-        found.append((["swarmnet", "train", str(data), *_flags(Train, train)], "model and learning curves"))
+        about_it = "model and learning curves"
+        if about.get("initial"):
+            train["freeze"], about_it = about.get("freeze") or (), f"{about_it}; tuned: add --init and the run it was"
+        found.append((["swarmnet", "train", str(data), *_flags(Train, train)], about_it))
     elif command := about.get("data", {}).get("import", {}).get("command"):
         found.append((shlex.split(command), "training data"))
         if learned := about["data"].get("learn"):
@@ -41,6 +44,7 @@ def commands(facts: Facts) -> list[tuple[str, str]]:
             judged.pop("preset", None)  # the model's training world, whatever else was set there
         elif facts.counts and judged.get("preset"):
             judged |= dict(zip(("num_obstacles", "num_agents"), facts.counts[1:], strict=True))
+        judged |= e.get("asked", {})
         found.append((["swarmnet", "evaluate", str(run), *_flags(Evaluate, judged)], "rollouts, tables, figures"))
     found.append((["swarmnet", "report", str(run)], "this page and figures/"))
     lines = [(shlex.join(words), comment) for words, comment in found]

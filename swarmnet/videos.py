@@ -3,6 +3,7 @@
 `python -m swarmnet.videos RUN FOLDER` writes the pictures of the README from a run.
 """
 
+import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -76,7 +77,7 @@ def _counted(shown: Film, progress: Progress | None) -> Iterator[np.ndarray]:
 
 
 def make_videos(run: str | Path, count: int, *, progress: Progress | None = None, size: int = 480) -> list[VideoFile]:
-    """Writes RUN/videos: expert | model for the `count` most telling scenes from above, and the first of them tilted.
+    """Writes RUN/videos: reference | model for the `count` most telling scenes from above, the first also tilted.
 
     Scenes in which the model touches something come first. Files newer than the rollouts are kept.
     """
@@ -84,7 +85,7 @@ def make_videos(run: str | Path, count: int, *, progress: Progress | None = None
     pair = load_pair(run, "expert", "learned")
     if pair is None or count < 1:
         return find_videos(run)
-    expert, learned = pair
+    (expert, learned), beside = pair, reference_of(run)
     wanted = [(scene, "top") for scene in telling_scenes(learned, count)]
     wanted.insert(1, (wanted[0][0], "tilted"))
     for old in (run / "videos").glob("scene-*"):
@@ -100,7 +101,7 @@ def make_videos(run: str | Path, count: int, *, progress: Progress | None = None
         hits = np.flatnonzero(((other.agent_contact > 0) | (other.solid_contact > 0)).any(axis=(0, 2)))
         row = max([other.position.shape[1] // 3, *hits[:1].tolist()])  # trails are long enough to see where all go
         pace = timing(one.dt, 2.0)
-        shown = compared(one, other, ("expert", "model"), f"scene {scene}", Look(camera=camera, size=size))
+        shown = compared(one, other, (beside, "model"), f"scene {scene}", Look(camera=camera, size=size))
         written = write_video(path, _with_still(shown.pictures, row * pace.between // pace.every, path), pace.fps)
         # Without ffmpeg a gif was written instead of the mp4; its still has the same name.
         path.with_suffix(".gif" if written.suffix == ".mp4" else ".mp4").unlink(missing_ok=True)
@@ -109,17 +110,24 @@ def make_videos(run: str | Path, count: int, *, progress: Progress | None = None
     return find_videos(run)
 
 
+def reference_of(run: Path) -> str:
+    """What the reference was called when the run was judged last: the expert, or another policy."""
+    path = run / "evaluation.json"
+    named = json.loads(path.read_text()).get("reference") if path.exists() else None
+    return named or "expert"
+
+
 def find_videos(run: str | Path) -> list[VideoFile]:
     """The videos of RUN/videos that are newer than its rollouts; the tilted view follows its scene, contacts first."""
     folder = Path(run) / "videos"
     paths = [p for p in folder.glob("*") if p.suffix in (".mp4", ".gif") and not p.name.startswith(".")]
     made = sorted((p for p in paths if _fresh(Path(run), p)), key=lambda p: (p.stat().st_mtime_ns, p.name))
-    found = []
+    found, beside = [], reference_of(Path(run))
     for path in made:
         known = _OURS.fullmatch(path.stem)
         title = path.stem
         if known:
-            title = f"Scene {int(known[1])}: expert | model" + (", tilted view" if known[2] == "tilted" else "")
+            title = f"Scene {int(known[1])}: {beside} | model" + (", tilted view" if known[2] == "tilted" else "")
         still = path.with_suffix(".jpg")
         found.append(VideoFile(path, title, still if still.exists() else None))
     return found

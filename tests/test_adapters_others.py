@@ -152,7 +152,7 @@ def test_a_missing_library_is_named_with_what_to_install(library: str, name: str
     assert result.returncode == 1
     said = result.stderr.strip().splitlines()[-1]
     assert f"SwarmError: {name} needs {library}, which is not installed" in said
-    assert f"pip install -e '.[{library}]'" in said
+    assert f"pip install {library}" in said
 
 
 def test_moving_obstacles_move_in_dm_control_too():

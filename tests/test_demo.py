@@ -72,7 +72,7 @@ def test_a_second_call_keeps_what_is_done_and_says_the_same(demo: Path, capsys):
         assert words in out
 
 
-@pytest.mark.parametrize("wrong", [("--scenes", "0"), ("--test-scenes", "0"), ("--scale", "nan")])
+@pytest.mark.parametrize("wrong", [("--scenes", "1"), ("--test-scenes", "0"), ("--scale", "nan"), ("--model", "kipf")])
 def test_bad_input_leaves_no_folder(wrong: tuple[str, str], tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main((*DEMO, *wrong)) == 2

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from learning import quick_training, tiny
+from learning import initial, quick_training, random_swarm, tiny
 
 from envs.collective import UNITS
 from envs.collisions import collision_report
@@ -21,10 +21,11 @@ from envs.storage import load, save
 from gnn.checkpoint import Model
 from gnn.decode import Integrator
 from gnn.features import Scales
+from swarm_mjcf.errors import SwarmError
 from swarmnet.cli import main
 from swarmnet.closed_loop import Stage, roll_out
-from swarmnet.judge import scenes_seen
-from swarmnet.policies import find_policy
+from swarmnet.judge import judge_policy, scenes_seen
+from swarmnet.policies import PolicyError, Source, find_policy
 
 SMALL = ("--scenes", "6", "--steps", "10", "--videos", "0", "--engine", "native")
 LAW = """
@@ -214,6 +215,26 @@ def test_what_cannot_be_judged_is_one_line(arguments: tuple[str, ...], said: str
     (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("swarmnet: "))
     assert said in line
     assert not Path("new").exists() or not list(Path("new").rglob("*.*"))
+
+
+def test_a_world_of_other_nodes_and_nothing_to_judge_are_one_line(tmp_path: Path):
+    """A mean over the types of edges has another width where a type is missing."""
+    world = SimulateConfig(num_agents=3, num_obstacles=1)
+    motion = Integrator(dt=0.3, substeps=15, max_speed=10.0, max_acceleration=5.0)
+    config = tiny("best")
+    history, _, graph = random_swarm(1, (1, 1, 3))
+    model = Model(config, Scales.ones(), motion, initial(config, Scales.ones(), history, graph, 0)[0], {"data": {}})
+    source = Source(given="r", name="r", model=model)
+    motion = world.world().scene
+    source = replace(source, model=replace(model, integrator=replace(model.integrator, substeps=motion.substeps)))
+    with pytest.raises(PolicyError, match=r"this world: has up to 1 goals, 0 obstacles and 3 agents"):
+        judge_policy(source, None, Stage.of(replace(world, num_obstacles=0)), tmp_path)
+    still = replace(model, config=tiny("thesis-ch3"))
+    (tmp_path / "rollouts").mkdir()
+    (tmp_path / "rollouts" / "learned.h5").write_text("of before")
+    with pytest.raises(SwarmError, match="nothing to judge without a reference"):
+        judge_policy(replace(source, model=still), None, Stage.of(world), tmp_path)
+    assert (tmp_path / "rollouts" / "learned.h5").read_text() == "of before"
 
 
 def test_scenes_of_ppo_and_of_repair_are_not_unseen():

@@ -10,12 +10,14 @@ import pytest
 from test_figures import ROWS, estimate, rates, scenes
 
 from envs.collisions import collision_report
+from envs.plain import plain
 from envs.storage import save
 from gnn.checkpoint import Checkpoints
+from repair.config import ConstraintConfig, LoopConfig
 from swarm_mjcf.errors import SwarmError
 from swarmnet.cli import parse
 from swarmnet.config import Demo, Evaluate, Render, Report, Simulate, Train
-from swarmnet.report import write_report
+from swarmnet.report import _repair_command, write_report
 from swarmnet.report_commands import commands
 from swarmnet.report_facts import gather
 
@@ -297,12 +299,23 @@ def test_commands_parse_and_say_what_was_done(tmp_path) -> None:
     assert (parsed[Evaluate].run, parsed[Evaluate].scenes, parsed[Evaluate].seed) == (run, 77, 99)
     assert parsed[Report].run == run
     assert parsed[Render].data == (run / "rollouts" / "expert.h5", run / "rollouts" / "learned.h5")
+    add_evaluation(run, asked={"filter": "barrier", "num_agents": 7})
+    judged = next(c for c in map(_parsed, commands(gather(run))) if isinstance(c, Evaluate))
+    assert (judged.filter, judged.num_agents) == ("barrier", 7)
     demo = {"name": "x", "scenes": 44, "test_scenes": 5, "model": "best", "scale": 0.1, "seed": 7, "engine": "auto"}
     (run / "config.json").write_text(json.dumps(demo | {"videos": 0}))
     parsed = {type(config): config for config in map(_parsed, commands(gather(run)))}
     assert {name: getattr(parsed[Demo], name) for name in demo} == demo
     assert parsed[Demo].videos == 3
     assert Train not in parsed
+
+
+def test_the_command_of_a_repair_has_its_switches_and_its_empty_lists(tmp_path) -> None:
+    how = LoopConfig(method="thesis", constraint=ConstraintConfig(name="diamond"), agents=False, polish=())
+    (tmp_path / "repair.json").write_text(json.dumps(repaired_document(settings=plain(how))))
+    line = _repair_command(gather(tmp_path), Path("runs/few"))
+    words = _parsed((line, ""))
+    assert (words.method, words.agents, words.polish, words.constraint.name) == ("thesis", False, (), "diamond")
 
 
 def _parsed(line: tuple[str, str]):

@@ -48,7 +48,7 @@ except SwarmError as error:
 """
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
-    assert "pip install -e '.[warp]'" in result.stdout
+    assert "pip install 'mujoco-mjx[warp]<4'" in result.stdout
     assert "NVIDIA" in result.stdout
     assert result.stdout.count("\n") == 1
 

@@ -37,7 +37,7 @@ print(getattr(sys, "_base_executable", None) or sys.executable)
 # Candidates are judged by running them: a shim or a link may exist, come first on PATH, and fail.
 try_python() {
     if found=$("$1" -c "$probe" 2>&1); then
-        python=$found
+        python=$(printf '%s\n' "$found" | tail -n 1) # a shim may warn before
         return 0
     fi
     refused="$refused
@@ -109,6 +109,10 @@ fail() {
     say "Run make setup again to go on."
     exit 1
 }
+
+# Somebody's habits of installing elsewhere, or of finding packages there, are not for this environment.
+unset PYTHONPATH PYTHONHOME PIP_TARGET PIP_PREFIX
+export PIP_USER=0
 
 # Runs pip, keeps its log, and shows how far it is.
 pip_install() {

@@ -30,6 +30,4 @@ def __getattr__(name: str) -> Any:
         library = (error.name or "").partition(".")[0]
         if library not in _EXTRAS:
             raise
-        raise SwarmError(
-            f"{name} needs {library}, which is not installed: pip install -e '.[{library}]' in the project's folder"
-        ) from error
+        raise SwarmError(f"{name} needs {library}, which is not installed: .venv/bin/pip install {library}") from error

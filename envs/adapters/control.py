@@ -13,11 +13,13 @@ from dm_env import specs
 from envs.adapters.core import SwarmCore
 from envs.adapters.deepmind import observation_spec
 from envs.adapters.scene import mean_reward
+from envs.config import SEEDS
 from envs.dynamics import limited
 from envs.engines.engine import obstacle_path, read_sensors
 from envs.state import Contacts, State, no_contacts
 from envs.swarm_env import scene_keys
 from swarm_mjcf.build import to_xml
+from swarm_mjcf.errors import SpecError
 from swarm_mjcf.index import Address, SceneIndex
 from swarm_mjcf.spec import SceneSpec
 
@@ -62,6 +64,8 @@ class SwarmTask(control.Task):
     """Of the last control step; `agent_depth` is left 0."""
 
     def __init__(self, core: SwarmCore, *, seed: int = 0) -> None:
+        if not 0 <= seed < SEEDS:
+            raise SpecError("seed", seed, f"a whole number in 0..{SEEDS - 1}")
         self.core, self.spec = core, core.spec
         self._seed, self._next = seed, 0
         self._nothing = jax.device_get(no_contacts(1, self.spec.num_agents))

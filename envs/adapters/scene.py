@@ -64,7 +64,10 @@ def scene_option(options: dict[str, Any] | None, *, strict: bool = True) -> int 
     options = options or {}
     if strict and set(options) - {"scene"}:
         raise SpecError("options", sorted(options), "scene: which scene of the seed to play")
-    return None if options.get("scene") is None else int(options["scene"])
+    scene = options.get("scene")
+    if scene is not None and not isinstance(scene, int | np.integer):
+        raise SpecError("scene", scene, "a whole number")
+    return None if scene is None else int(scene)
 
 
 def mean_reward(reward: Float[Array, "*S N"], present: Bool[Array, "*S N"]) -> Float[np.ndarray, "*S"]:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 ENGINES = ("native", "mjx")
 OPTIONAL_ENGINES = ("mjx-warp",)
-"""Engines that an extra installs: `pip install -e '.[warp]'` in the project's folder."""
+"""Engines that an extra installs: `.venv/bin/pip install 'mujoco-mjx[warp]<4'`."""
 
 
 def make_engine(spec: SceneSpec, name: str = "auto", *, threads: int = 0) -> "Engine":

@@ -28,7 +28,7 @@ from swarm_mjcf.spec import SceneSpec
 
 if importlib.util.find_spec("warp") is None:
     raise EngineError(
-        "the engine mjx-warp is not installed: pip install -e '.[warp]' in the project's folder (390 MB "
+        "the engine mjx-warp is not installed: .venv/bin/pip install 'mujoco-mjx[warp]<4' (390 MB "
         "on disk; for machines with an NVIDIA GPU, on others it runs slowly)"
     )
 with contextlib.redirect_stdout(io.StringIO()):  # it greets where a program's output belongs

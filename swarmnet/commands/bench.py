@@ -17,7 +17,6 @@ from gnn.evaluate import constant_velocity, persistence, prediction_error
 from gnn.train import train
 from swarm_mjcf.build import compile_scene
 from swarm_mjcf.spec import SceneSpec
-from swarmnet.bench_adapters import bench_adapters
 from swarmnet.bench_engines import bench_engines
 from swarmnet.bench_experts import bench_experts
 from swarmnet.bench_repair import Part, Proof, bench_repair, network
@@ -77,6 +76,8 @@ def _experts(config: Bench) -> Results:
 
 
 def _adapters(config: Bench) -> Results:
+    from swarmnet.bench_adapters import bench_adapters  # the libraries that it adapts to are optional
+
     rows = []
     for cell in bench_adapters(turns=5 * config.repeats):
         where = f"adapters.{cell.adapter}.{cell.policy}.s{cell.scenes}".replace(" ", "_")

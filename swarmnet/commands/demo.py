@@ -11,7 +11,7 @@ from envs.plain import plain
 from envs.simulate import simulate
 from envs.storage import load
 from gnn.checkpoint import load_model
-from gnn.config import TrainConfig
+from gnn.config import TrainConfig, model_preset
 from gnn.train import train
 from swarm_mjcf.errors import SpecError, SwarmError
 from swarmnet.commands.train import note
@@ -28,8 +28,10 @@ TEST_SEED = 1_000_000
 
 def run(config: Demo) -> int:
     """Does what is missing in runs/NAME and says what came out."""
-    if config.model == "thesis-ch3":
-        raise SpecError("model", config.model, "thesis-ch5 or best: the demo's model steers agents, ch3 only predicts")
+    if not model_preset(config.model).acts:
+        raise SpecError("model", config.model, "one that steers, such as thesis-ch5 or best: others only predict")
+    if config.scenes < 2:
+        raise SpecError("scenes", config.scenes, "at least 2: one is kept for validation")
     world = SimulateConfig(preset="clear", scenes=config.scenes, seed=config.seed, engine=config.engine)
     unseen = replace(world, scenes=config.test_scenes, seed=config.seed + TEST_SEED)
     training = TrainConfig(model=config.model, seed=config.seed).scaled(config.scale)

@@ -3,6 +3,7 @@
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 from envs.config import SimulateConfig
 from repair.config import ConstraintConfig
@@ -39,8 +40,17 @@ def run(config: Evaluate) -> int:
         reference = None if config.reference == NONE else find_policy(config.reference)
         stage, reference = _stage(config, source, reference)
         judgement = judge_policy(source, reference, stage, folder, log=config.log)
+        judgement = replace(judgement, asked=_asked(config))
     conclude(judgement, folder, videos=config.videos, json=config.json)
     return 0
+
+
+def _asked(config: Evaluate) -> dict[str, Any]:
+    """What a judgement does not say by itself, where it is not as usual: for the command that makes it again."""
+    names = ("num_agents", "num_obstacles", "filter", "filter_margin", "filter_share", "perception_noise")
+    usual = {field.name: field.default for field in fields(Evaluate)}
+    values = {name: getattr(config, name) for name in (*names, "actuation_noise", "log")}
+    return {name: value for name, value in values.items() if value != usual[name]}
 
 
 def shield_of(config: Evaluate) -> ConstraintConfig | None:

@@ -98,6 +98,12 @@ def _data(config: Probe, model: Model) -> tuple[Trajectories, ExpertConfig | Non
     data = data.take(slice(0, config.scenes))
     if len(data) < 4:
         raise SwarmError(f"{config.data}: holds {len(data)} scenes, a probe needs at least 4")
+    trained = model.integrator
+    if abs(trained.dt - data.dt) > 1e-6 or trained.substeps != data.substeps:
+        raise SwarmError(
+            f"{config.data}: has rows {data.dt:g} s apart with {data.substeps} substeps, the model was trained at "
+            f"dt {trained.dt:g} s with {trained.substeps}"
+        )
     settings = data.provenance.get("simulate")
     return data, None if settings is None else from_plain(SimulateConfig, settings).world().expert
 

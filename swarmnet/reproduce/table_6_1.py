@@ -313,7 +313,7 @@ def _predicted(row: str, model: Model, policies: Policies) -> dict[str, float]:
 
 
 def _learned_from(policies: Policies) -> Trajectories:
-    return recordings(replace(THESIS, scenes=100, seed=policies.seed), policies.effort)
+    return recordings(replace(THESIS, scenes=100, seed=SCENES + policies.seed), policies.effort)
 
 
 def squared(model: Model, truth: Trajectories, *, horizon: int = 10) -> float:
