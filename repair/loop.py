@@ -357,12 +357,12 @@ def _polish(work: _Work, params: Params, rows: Situations, tell: Progress) -> Pa
     """Quadratic programs for counter-examples that still break the constraint; None where there are none."""
     config = work.config
     now = screen(work.must, rows, work.act(params, rows), work.bodies, work.kinematics)
-    if not now.avoidable.any() or not config.polish or not work.pool.count:
+    if not now.violated.any() or not config.polish or not work.pool.count:
         return None
     lessons = _doubles(work.pool)
     anchors = lessons.situations.take(np.random.default_rng(config.seed).permutation(len(lessons))[: config.anchors])
-    # What was learned so far should stay.
-    problem = work.problem(work.must, rows.take(now.possible & now.apart), anchors, work.act(params, anchors))
+    # All rows can be mended, or they would not be here; what was learned so far should stay.
+    problem = work.problem(work.must, rows, anchors, work.act(params, anchors))
     free = FreeWeights.matching(params, config.polish)
     total = config.rounds + 1
 
