@@ -198,8 +198,8 @@ def test_simulate_train_evaluate_in_a_row(tmp_path: Path, monkeypatch, capsys):
     assert "substeps" in other or "other kinds of nodes" in other
     faster = ("--num-agents", "2", "--preset", "published", "--dt", "0.1", "--out", "p.h5")
     assert main(("simulate", "--scenes", "6", "--steps", "12", *faster)) == 0
+    capsys.readouterr()
     assert "rows 0.1 s apart" in fails(capsys, "probe", "r", "--data", "p.h5")
-    assert "in 0..999999" in fails(capsys, "reproduce", "table-3.1", "--seeds", "1000000")
     assert main(("evaluate", "r", "--scenes", "3", "--steps", "12", "--videos", "0", "--json", "e.json")) == 0
     out = capsys.readouterr().out
     for words in ("swarmnet thesis-ch5", "constant velocity", "persistence", "3 unseen scenes", "dt 0.3 s", "report:"):

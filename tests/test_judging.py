@@ -223,7 +223,7 @@ def test_a_world_of_other_nodes_and_nothing_to_judge_are_one_line(tmp_path: Path
     motion = Integrator(dt=0.3, substeps=15, max_speed=10.0, max_acceleration=5.0)
     config = tiny("best")
     history, _, graph = random_swarm(1, (1, 1, 3))
-    model = Model(config, Scales.ones(), motion, initial(config, Scales.ones(), history, graph, 0)[0], {"data": {}})
+    model = Model(config, Scales.ones(), motion, initial(config, Scales.ones(), history, graph), {"data": {}})
     source = Source(given="r", name="r", model=model)
     motion = world.world().scene
     source = replace(source, model=replace(model, integrator=replace(model.integrator, substeps=motion.substeps)))

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -312,8 +313,8 @@ def test_commands_parse_and_say_what_was_done(tmp_path) -> None:
 
 def test_the_command_of_a_repair_has_its_switches_and_its_empty_lists(tmp_path) -> None:
     how = LoopConfig(method="thesis", constraint=ConstraintConfig(name="diamond"), agents=False, polish=())
-    (tmp_path / "repair.json").write_text(json.dumps(repaired_document(settings=plain(how))))
-    line = _repair_command(gather(tmp_path), Path("runs/few"))
+    settings = json.loads(json.dumps(plain(how)))
+    line = _repair_command(replace(gather(tmp_path), about={"repair": {"settings": settings}}), Path("runs/few"))
     words = _parsed((line, ""))
     assert (words.method, words.agents, words.polish, words.constraint.name) == ("thesis", False, (), "diamond")
 

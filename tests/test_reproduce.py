@@ -505,6 +505,12 @@ def test_cells_of_another_machine_are_taken_for_done_and_merged(fake: Fake, tmp_
     assert [cell["values"] for cell in there["cells"]] == [cell["values"] for cell in here["cells"]]
 
 
+def test_seeds_of_unseen_scenes_are_refused():
+    assert Reproduce(seeds=(999_999,)).seeds == (999_999,)
+    with pytest.raises(SpecError, match=r"seeds.*1000000.*in 0\.\.999999"):
+        Reproduce(seeds=(0, 1_000_000))
+
+
 def test_known_results_that_do_not_fit_are_refused_before_anything_is_written(fake: Fake, tmp_path: Path, capsys):
     out = ["--profile", "cpu", "--out", str(tmp_path / "out")]
     assert main(["reproduce", "fake", "--profile", "cpu", "--seeds", "0", "--out", str(tmp_path)]) == 0
