@@ -111,7 +111,7 @@ class LoopConfig:
     pool: int = 200_000
     """Decisions in the pool at most; the oldest go."""
     hard: int = 1000
-    """Counter-examples of a round that become constrained rows: the worst."""
+    """Counter-examples of a round that become constrained rows: the worst; with relax, a sample."""
     anchors: int = 2000
     """Decisions that the quadratic programs leave as they are."""
     price: float = 100.0

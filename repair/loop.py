@@ -328,7 +328,8 @@ def _programmed(work: _Work, params: Params, number: int, within: Callable) -> t
     lessons = _doubles(work.pool)
     now = screen(work.aim, lessons.situations, work.act(params, lessons.situations), work.bodies, work.kinematics)
     broken = np.flatnonzero(now.violated & lessons.bound)
-    constrained = broken[np.argsort(now.slack[broken], kind="stable")[: work.config.hard]]
+    # A sample: the worst alone pull weights as few as these where nothing holds any more.
+    constrained = rng.permutation(broken)[: work.config.hard]
     anchors = rng.permutation(len(lessons))[: work.config.anchors]
     problem = work.problem(
         work.aim, lessons.situations.take(constrained), lessons.situations.take(anchors), lessons.target[anchors]

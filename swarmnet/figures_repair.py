@@ -35,6 +35,7 @@ def pareto(
     with mpl.rc_context(PAPER):
         figure = blank_figure(3.5 * len(costs), 3.4 + 0.1 * len(lines))
         colours = dict(zip(names, mpl.colormaps["tab10"](np.arange(len(names)) % 10), strict=True))
+        markers = {name: "oD^"[number // 10 % 3] for number, name in enumerate(names)}  # there are ten colours
         first = None
         for column, cost in enumerate(costs):
             first = ax = figure.add_subplot(1, len(costs), column + 1, sharey=first)
@@ -42,7 +43,7 @@ def pareto(
                 pairs = [(v[cost], v[contacts]) for n, v in points if n == name and _there(v, cost, contacts)]
                 if pairs:
                     x, y = np.array(pairs).T
-                    ax.plot(x, np.maximum(y, FLOOR), "o", ms=4, color=colours[name], gid=name, clip_on=False)
+                    ax.plot(x, np.maximum(y, FLOOR), markers[name], ms=4, color=colours[name], gid=name, clip_on=False)
             ax.set(xlabel=cost, ylabel=contacts if column == 0 else "", yscale="log")
             ax.label_outer(remove_inner_ticks=False)
             reached = [v[cost] for _, v in points if _there(v, cost, contacts)]
@@ -50,7 +51,7 @@ def pareto(
                 ax.set_xscale("log")
             if " / " in cost:
                 ax.axvline(1, color="0.7", lw=0.8, zorder=0)
-        handles = [Line2D([], [], marker="o", ls="", ms=4, color=colours[n], label=n) for n in names]
+        handles = [Line2D([], [], marker=markers[n], ls="", ms=4, color=colours[n], label=n) for n in names]
         figure.legend(handles=handles, loc="outside upper center", ncols=min(len(names), 5), frameon=False)
         if lines:
             below = (0.1 * len(lines) + 0.05) / figure.get_figheight()
