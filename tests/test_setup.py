@@ -35,6 +35,11 @@ def is_this_python(result: subprocess.CompletedProcess[str]) -> bool:
     return result.returncode == 0 and Path(result.stdout.strip()).samefile(Path(sys.executable).resolve())
 
 
+def test_a_shim_may_warn_before_it_answers(tmp_path: Path):
+    script(tmp_path / "python3.12", f'echo "WARN missing: node" >&2\nexec {sys.executable} "$@"')
+    assert is_this_python(find_python(path=tmp_path))
+
+
 def test_a_failing_shim_and_an_old_python_are_passed_over(tmp_path: Path):
     script(tmp_path / "python3.12", FAILING_SHIM)
     script(tmp_path / "python3.13", OLD_PYTHON)

@@ -34,10 +34,12 @@ except ImportError:
 print(getattr(sys, "_base_executable", None) or sys.executable)
 '
 
+newline='
+'
 # Candidates are judged by running them: a shim or a link may exist, come first on PATH, and fail.
 try_python() {
     if found=$("$1" -c "$probe" 2>&1); then
-        python=$(printf '%s\n' "$found" | tail -n 1) # a shim may warn before
+        python=${found##*"$newline"} # the last line: a shim may warn before it
         return 0
     fi
     refused="$refused

@@ -101,7 +101,8 @@ def _times(path: Path, config: ImportConfig, runs: int, rows: int) -> tuple[np.n
 def _array(path: Path, dimensions: int, shape: str) -> np.ndarray:
     readable(path)
     try:
-        array = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:  # of a damaged one, np.load leaves its own open
+            array = np.load(file, allow_pickle=False)
     except (ValueError, OSError, EOFError, TokenError, BadZipFile) as error:
         raise ImportFailed(
             f"{path}: is no array of numbers in NumPy's format ({str(error).splitlines()[0]})"
