@@ -26,7 +26,8 @@ def commands(facts: Facts) -> list[tuple[str, str]]:
             train["validation"] = kept / all_scenes
         about_it = "model and learning curves"
         if about.get("initial"):
-            train["freeze"], about_it = about.get("freeze") or (), f"{about_it}; tuned: add --init and the run it was"
+            train["freeze"] = about.get("freeze") or ()
+            about_it += "; tuned: add --init with the run that it began from"
         found.append((["swarmnet", "train", str(data), *_flags(Train, train)], about_it))
     elif command := about.get("data", {}).get("import", {}).get("command"):
         found.append((shlex.split(command), "training data"))

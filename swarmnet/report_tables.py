@@ -91,6 +91,8 @@ def repair_table(facts: Facts) -> dict[str, str]:
     except (ValueError, KeyError, TypeError, StopIteration) as error:
         raise SwarmError(f"{path}: is damaged; `swarmnet repair` writes it anew") from error
     left = v["avoidable"]
+    once = how.get("method") in ("thesis", "last-layer")  # these take states whatever was decided there
+    which = "could keep it" if once else "broke it without need while the policy was repaired"
     hold = "all of them keep it" if not left else f"{left} of them still break it"
     touched = round(judged["trajectories"] * judged["scenes"])
     _, most = clopper_pearson(touched, judged["scenes"])
@@ -98,7 +100,7 @@ def repair_table(facts: Facts) -> dict[str, str]:
     words = (
         f"Only {free} were changed, so that the {escape(rule['name'])} (margin {rule['margin']:g} m, "
         f"{100 * rule['share']:g}% of the brakes) holds. <b>What is guaranteed:</b> of {v['rows']} decisions that "
-        f"broke it without need while the policy was repaired, {hold} now, checked in 64-bit arithmetic with the saved "
+        f"{which}, {hold} now, checked in 64-bit arithmetic with the saved "
         "weights, limits and integrator. <b>What is evidence:</b> in "
         f"{judged['scenes']} scenes that it did not learn from, {touched} had a contact; with 95% confidence at most "
         f"{100 * most:.2g}% of scenes like these have one. <b>What is not claimed:</b> anything about other scenes. "

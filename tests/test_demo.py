@@ -85,7 +85,8 @@ def test_what_another_command_judged_is_not_taken_for_the_demo_s(demo: Path, tmp
     name, path = "swarmnet thesis-ch5", tmp_path / "evaluation.json"
     assert not _judged(path, unseen, name)
     other = {"swarmnet thesis-ch5, 3 nearest": 0, "expert": 0}
-    for change, own in (({}, True), ({"seed": 7}, False), ({"scenes": 5}, False), ({"collisions": other}, False)):
+    changes = ({"seed": 7}, {"scenes": 5}, {"steps": 9}, {"collisions": other}, {"asked": {"actuation_noise": 1.0}})
+    for change, own in (({}, True), *((change, False) for change in changes)):
         path.write_text(json.dumps(judged | change))
         assert _judged(path, unseen, name) == own, change
 

@@ -117,6 +117,15 @@ def test_no_sample_of_the_box_beats_the_bound(constraint, largest):
     assert jax.tree.all(jax.tree.map(lambda a, b: (a == b).all(), given, before))
 
 
+def test_a_margin_that_is_charged_for_is_no_part_of_the_bound():
+    """All of a small box breaks the conditions: weights that cost less than what was found must not beat the bound."""
+    question, given = problem(4, price=5.0, margin=0.05), network()
+    found = polish(given, question, free=EDGE, radius=0.05, limits=LIMITS)
+    consistent(found, question, given, 0.05)
+    least = min(cost(replace(question, margin=0.0), tried) for tried in samples(given, EDGE, 0.05, 300))
+    assert found.bound <= least < found.incumbent
+
+
 def test_hard_conditions_are_kept_and_proven():
     question, given = problem(3, limit=4.0), network()
     found = polish(given, question, free=NODE, radius=1.0, limits=LIMITS)

@@ -83,8 +83,9 @@ def _judged(path: Path, unseen: SimulateConfig, name: str) -> bool:
     if not path.exists():
         return False
     had = json.loads(path.read_text())
-    wanted = (unseen.seed, unseen.scenes, {"expert", name})
-    return (had.get("seed"), had.get("scenes"), set(had.get("collisions", ()))) == wanted
+    wanted = (unseen.seed, unseen.scenes, unseen.steps, unseen.preset, {}, {"expert", name})
+    found = [had.get(key) for key in ("seed", "scenes", "steps", "preset")]
+    return (*found, had.get("asked", {}), set(had.get("collisions", ()))) == wanted
 
 
 def summary(judgement: dict, name: str) -> str:

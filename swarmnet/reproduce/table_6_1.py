@@ -306,13 +306,13 @@ def _predicted(row: str, model: Model, policies: Policies) -> dict[str, float]:
         return {}
     found = {}
     unseen = recordings(replace(THESIS, scenes=min(250, policies.effort.test_scenes), seed=TEST_SEED), policies.effort)
-    for part, truth in (("train", _learned_from(policies)), ("test", unseen)):
+    for part, truth in (("train", _expert_in_train_scenes(policies)), ("test", unseen)):
         found[f"{part} MSE [m^2]"] = squared(model, truth)
     ten = [published_mean(of.predict, of.params, unseen, window=1, horizon=10) for of in (model, policies.imitated())]
     return found | {DEVIATION: ten[0] / ten[1]}
 
 
-def _learned_from(policies: Policies) -> Trajectories:
+def _expert_in_train_scenes(policies: Policies) -> Trajectories:
     return recordings(replace(THESIS, scenes=100, seed=SCENES + policies.seed), policies.effort)
 
 
