@@ -209,8 +209,8 @@ class Report:
 class Doctor:
     """Print versions, devices, GL renderer and threads, and what is wrong with a fix for each.
 
-    With --engines, native and mjx are checked against sphere geometry and against each other on random dense scenes
-    without walls, and the numbers of wrong and borderline contact flags are printed.
+    With --engines, every engine here is checked against sphere geometry and against the others on random dense scenes
+    with walls, and the numbers of wrong and borderline contact flags and counts are printed.
 
     Example:
       swarmnet doctor --engines

@@ -1,5 +1,6 @@
 """Physics engines behind one protocol. Names: `native` (C, threads), `mjx` (XLA), `mjx-warp` (CUDA; an extra)."""
 
+import importlib.util
 from typing import TYPE_CHECKING
 
 from swarm_mjcf.errors import SpecError
@@ -9,8 +10,13 @@ if TYPE_CHECKING:
     from envs.engines.engine import Engine
 
 ENGINES = ("native", "mjx")
-OPTIONAL_ENGINES = ("mjx-warp",)
-"""Engines that an extra installs: `.venv/bin/pip install 'mujoco-mjx[warp]<4'`."""
+OPTIONAL_ENGINES = {"mjx-warp": "warp"}
+"""Engines that an extra installs, and the module that it brings: `.venv/bin/pip install 'mujoco-mjx[warp]<4'`."""
+
+
+def available() -> tuple[str, ...]:
+    """Engines that this machine has: `ENGINES`, and the optional ones whose extra is installed."""
+    return ENGINES + tuple(name for name, module in OPTIONAL_ENGINES.items() if importlib.util.find_spec(module))
 
 
 def make_engine(spec: SceneSpec, name: str = "auto", *, threads: int = 0) -> "Engine":
@@ -35,4 +41,4 @@ def make_engine(spec: SceneSpec, name: str = "auto", *, threads: int = 0) -> "En
         from envs.engines.mjx_warp import MjxWarpEngine
 
         return MjxWarpEngine(spec)
-    raise SpecError("engine", name, "one of auto, " + ", ".join(ENGINES + OPTIONAL_ENGINES))
+    raise SpecError("engine", name, "one of auto, " + ", ".join((*ENGINES, *OPTIONAL_ENGINES)))

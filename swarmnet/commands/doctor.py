@@ -8,10 +8,10 @@ import sys
 
 import jax
 
-from envs.engines import ENGINES
+from envs.engines import available
 from swarm_mjcf.render import check_gl
 from swarmnet.config import Doctor
-from swarmnet.engine_check import check_engines
+from swarmnet.engine_check import SUBSTEPS, check_engines
 from swarmnet.progress import progress
 from swarmnet.results import Results, Row, hardware, write_results
 
@@ -81,18 +81,23 @@ def _ffmpeg() -> list[tuple[str, str]]:
 
 def _engines(config: Doctor) -> list[tuple[str, str]]:
     with progress("check engines") as update:
-        verdicts, comparisons = check_engines(ENGINES, config.scenes, progress=update)
+        verdicts, comparisons = check_engines(available(), config.scenes, progress=update)
     rows, problems = [], []
     for name, v in verdicts.items():
         print(
             f"engine {name}: {v.scenes} scenes ({v.touching_scenes / v.scenes:.0%} touching), {v.flags} contact flags, "
-            f"{v.on} on, {v.wrong} wrong, {v.borderline} borderline"
+            f"{v.on} on, {v.wrong} wrong, {v.borderline} borderline; {v.counts} counts of {SUBSTEPS} substeps, "
+            f"{v.wrong_counts} wrong, {v.borderline_counts} borderline"
         )
-        for column in ("scenes", "touching_scenes", "flags", "on", "wrong", "borderline"):
+        for column in vars(v):
             rows.append(Row(name, column, getattr(v, column)))
         if v.wrong:
             problems.append(
                 (f"engine {name} has {v.wrong} wrong contact flags", "use another engine; report the device")
+            )
+        if v.wrong_counts:
+            problems.append(
+                (f"engine {name} has {v.wrong_counts} wrong contact counts", "take 1 substep; report the device")
             )
     for (one, other), c in comparisons.items():
         print(
