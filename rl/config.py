@@ -55,7 +55,7 @@ class PPOConfig:
     """Weight of the entropy bonus."""
     imitation_weight: float = 0.0
     """Weight of the squared distance from the first policy's actions, in units of the acceleration limit."""
-    initial_std: float = 0.1
+    initial_std: float = 0.2
     """Exploration at the start: standard deviation of each action in units of the acceleration limit."""
     target_kl: float = 0.03
     """An update ends early when the policy has moved this far from the one that acted."""
