@@ -22,10 +22,16 @@ class Kinematics(Protocol):
     def max_acceleration(self) -> float: ...
 
 
+_SQUARABLE = 1e18
+"""Far below the root of float32's largest number, far above any limit."""
+
+
 def clip_norm(vector: Float[Array, "*n 2"], limit: float) -> Float[Array, "*n 2"]:
     """Vectors longer than `limit` shortened to it. Differentiable everywhere, zero included."""
     if limit == float("inf"):
         return vector
+    # Squares of what a repulsive force can be overflow; whatever is shorter stays bit for bit.
+    vector = vector / jnp.maximum(jnp.abs(vector).max(axis=-1, keepdims=True) / _SQUARABLE, 1)
     square = jnp.sum(vector * vector, axis=-1, keepdims=True)
     long = square > limit * limit
     return vector * jnp.where(long, limit / jnp.sqrt(jnp.where(long, square, 1)), 1)

@@ -77,7 +77,8 @@ class Relaxation:
     trust: float = 1e-3
     """tau at the first step; it shrinks after a good step and grows after a refused one."""
     margin: float = 0.02
-    """Added to every condition, so that rounding and solver tolerance do not undo it [m/s^2]."""
+    """Added to every condition, so that rounding and solver tolerance do not undo it [m/s^2]; it shrinks for rows that
+    are left over, which may have less room."""
     tolerance: float = 1e-4
     """A condition missed by less holds [m/s^2]."""
 
@@ -115,12 +116,12 @@ def relax(
     began = time.perf_counter()
     linearised = linearised or Linearised(free, problem.scales, normalise=problem.normalise)
     home = free.vector(params if origin is None else origin)
-    price = settings.price
+    price, margin = settings.price, np.full(len(problem.constrained), settings.margin)
     trust, merit, history = settings.trust, _merit(problem, params, free, home, settings), []
     for step in range(settings.steps):
         if time.perf_counter() - began > time_limit:
             break
-        model = _linear_model(problem, params, free, home, settings, linearised)
+        model = _linear_model(problem, params, free, home, settings, linearised, margin)
         taken, tight, found = None, 0, merit
         for _ in range(4):
             change, tight = model.solve(trust)
@@ -139,7 +140,9 @@ def relax(
         if fell < 1e-3 * max(merit["merit"], 1e-9):
             if merit["violated"] == 0 or settings.price > 1e4 * price:
                 break
-            # What is still missed is not worth mending at this price.
+            # What is still missed is not worth mending at this price, or has less room than the margin.
+            missed = problem.shortfall(problem.act(params, problem.constrained)) > settings.tolerance
+            margin = np.where(missed.any(axis=1), margin / 2, margin)
             settings = replace(settings, price=4 * settings.price)
             merit = _merit(problem, params, free, home, settings)
     violated = merit["violated"]
@@ -166,6 +169,7 @@ def _linear_model(
     home: Float[Array, " P"],
     settings: Relaxation,
     linearised: Linearised,
+    margin: Float[Array, " R"],
 ) -> "_Model":
     anchored = linearised.jacobian(params, problem.anchors)
     count = len(problem.targets)
@@ -176,7 +180,7 @@ def _linear_model(
     gradient = flat.T.astype(np.float64) @ residual / count + settings.stiffness * way
     now = problem.act(params, problem.constrained)
     planes = problem.planes(now)
-    missing = planes.offset + settings.margin - np.sum(planes.normal * now[:, None], axis=-1)
+    missing = planes.offset + margin[:, None] - np.sum(planes.normal * now[:, None], axis=-1)
     return _Model(
         gram, gradient, settings.stiffness, linearised.jacobian(params, problem.constrained), planes.normal, missing,
         settings.price / max(len(now), 1),

@@ -90,9 +90,9 @@ class SceneSpec:
                 raise SpecError(field, value, f"a number above 0 [{unit}], or inf for no limit")
         if not _is_number(self.solref_timeconst) or not 2 <= self.solref_timeconst < math.inf:
             raise SpecError("solref_timeconst", self.solref_timeconst, "at least 2 [physics timesteps]")
-        if max(self.agent_radius, self.obstacle_radius) >= self.arena:
-            field = "agent_radius" if self.agent_radius >= self.arena else "obstacle_radius"
-            raise SpecError(field, getattr(self, field), f"below the arena's half-width of {self.arena} m")
+        for field in ("agent_radius", "obstacle_radius") if self.num_obstacles else ("agent_radius",):
+            if getattr(self, field) >= self.arena:
+                raise SpecError(field, getattr(self, field), f"below the arena's half-width of {self.arena} m")
         if self.contacts and self.timestep > self.max_timestep * (1 + 1e-9):
             if not math.isfinite(self.max_speed):
                 raise SpecError("max_speed", self.max_speed, "finite when contacts are on: inf would need inf substeps")

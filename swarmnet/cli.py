@@ -70,6 +70,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     except OSError as error:
         return _fail(f"{error.filename or ''}: {error.strerror or error}".lstrip(": "))
+    except RuntimeError as error:
+        # What an engine raises inside a compiled function reaches us as text at the end of JAX's own error.
+        _, raised, message = str(error).rpartition("EngineError: ")
+        if not raised:
+            raise
+        return _fail(message)
     except KeyboardInterrupt:
         print("\nswarmnet: interrupted; the same command goes on from what is saved", file=sys.stderr)
         return 130

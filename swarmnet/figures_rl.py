@@ -85,6 +85,15 @@ def first_reach(curve: History, target: float) -> float:
     return float(curve.env_steps[there[0]]) if len(there) else float("nan")
 
 
+def needed(curve: History, scratch: History) -> Float[np.ndarray, " I"]:
+    """For every budget that `scratch` had, the share of it after which `curve` first has the return that `scratch` ends
+    it with, smoothed likewise; NaN where it never does."""
+    best = np.maximum.accumulate(np.where(np.isfinite(curve.value), curve.value, -np.inf))
+    at = np.searchsorted(best, scratch.value)  # NaN is sorted behind everything
+    reached = np.append(curve.env_steps, np.nan)[at]
+    return reached / scratch.env_steps
+
+
 def together(
     lines: Sequence[tuple[np.ndarray, np.ndarray]], points: int = 200
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "seeds p"]]:
@@ -99,30 +108,39 @@ def together(
 
 @mpl.rc_context(PAPER)
 def return_history(
-    curves: Mapping[str, Sequence[History]], events: Mapping[str, Sequence[float]], *, note: str = ""
+    curves: Mapping[str, Mapping[int, History]],
+    events: Mapping[str, Sequence[float]],
+    *,
+    scratch: str = "scratch",
+    note: str = "",
 ) -> Figure:
-    """Figure 5.2: smoothed returns over env-steps and over wall time, and contact events of a trajectory as bars.
+    """Figure 5.2: smoothed returns over env-steps and over wall time, the share of the env-steps of `scratch` after
+    which the others have its return, and contact events of a trajectory as bars.
 
     Lines are means over seeds, bands and whiskers go from the least to the greatest. What stands behind a comma in a
     name (`mode 0, 10k`) gives line and hatch, in the colour of the name before it.
 
     Args:
-      curves: histories of all seeds by name.
+      curves: histories by name and seed.
       events: contact events per trajectory of all seeds by name.
+      scratch: name of the curves from random weights, which shares are of.
       note: small print below.
 
     Raises SpecError when there is nothing to draw.
     """
     if not curves and not events:
         raise SpecError("curves", dict(curves), "histories or contact events of at least one policy")
-    figure = blank_figure(WIDTHS["page"], 2.6)
-    over_steps, over_time, bars = figure.subplots(1, 3, width_ratios=(1, 1, 1))
+    figure = blank_figure(WIDTHS["page"], 4.6)
+    (over_steps, over_time), (shares, bars) = figure.subplots(2, 2)
+    random = curves.get(scratch, {})
     kinds = list(dict.fromkeys(["", *(_kind(name) for name in (*curves, *events))]))
     for name, seeds in curves.items():
         color, style = _color(name), _LINES[kinds.index(_kind(name)) % len(_LINES)]
+        pairs = [(one, random[seed]) for seed, one in seeds.items() if seed in random and name != scratch]
         for ax, lines in (
-            (over_steps, [(one.env_steps / 1e6, one.value) for one in seeds]),
-            (over_time, [(one.minutes, one.value) for one in seeds]),
+            (over_steps, [(one.env_steps / 1e6, one.value) for one in seeds.values()]),
+            (over_time, [(one.minutes, one.value) for one in seeds.values()]),
+            (shares, [(other.env_steps / 1e6, needed(one, other)) for one, other in pairs]),
         ):
             x, y = together(lines)
             if len(x):
@@ -130,10 +148,12 @@ def return_history(
                 ax.plot(x, y.mean(axis=0), color=color, ls=style, lw=1.2, label=name, gid=name)
     over_steps.set(xlabel="env-steps [million]", ylabel="return of an episode")
     over_time.set(xlabel="wall time [min]")
-    for ax in (over_steps, over_time):
+    shares.set(xlabel=f"env-steps of {scratch} [million]", ylabel="share that gives its return", ylim=(0, 1))
+    shares.axhline(0.2, color=_GREY, lw=0.6, ls=":")
+    for ax in (over_steps, over_time, shares):
         ax.set_xlim(left=0)
     _bars(bars, events, kinds)
-    for ax in (over_steps, over_time, bars):
+    for ax in (over_steps, over_time, shares, bars):
         ax.grid(axis="y", color="#e4e7ec", lw=0.5)
         ax.set_axisbelow(True)
         ax.spines[["top", "right"]].set_visible(False)

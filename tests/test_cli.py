@@ -272,6 +272,30 @@ def test_doctor_exits_with_1_and_a_fix_when_something_is_wrong(monkeypatch, caps
     assert "no problems found" not in out
 
 
+def test_an_engine_that_gives_up_inside_a_compiled_function_is_told_in_one_message(tmp_path: Path, monkeypatch, capsys):
+    from envs.engines.native import EngineError, NativeEngine
+
+    def gives_up(*_):
+        raise EngineError("native: out of room")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(NativeEngine, "_check_warnings", gives_up)
+    told = fails(capsys, "simulate", "--preset", "clear", "--scenes", "2", "--steps", "2", "--out", "d.h5")
+    assert told == "swarmnet: native: out of room"
+    assert not (tmp_path / "d.h5").exists()
+
+
+def test_an_error_of_our_own_is_no_bad_input(monkeypatch):
+    import swarmnet.commands.doctor as doctor
+
+    def broken(_):
+        raise RuntimeError("a mistake in the program")
+
+    monkeypatch.setattr(doctor, "run", broken)
+    with pytest.raises(RuntimeError, match="a mistake"):
+        main(("doctor",))
+
+
 def test_an_interruption_says_how_to_go_on(tmp_path: Path, monkeypatch, capsys):
     import swarmnet.commands.train as command
 

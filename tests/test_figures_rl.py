@@ -26,6 +26,7 @@ from swarmnet.figures_rl import (
     first_reach,
     history,
     make_rl_figures,
+    needed,
     policy_sheet,
     return_history,
     rl_curves,
@@ -120,11 +121,23 @@ def test_curves_of_a_training_show_what_was_measured(tmp_path):
     assert make_rl_figures(tmp_path) == []
 
 
+def test_what_share_of_random_weights_steps_gives_their_return():
+    """Better at 10 steps than scratch at 20 and 40, as good at 30 as scratch at 60, never as good as at 80."""
+    minutes = np.zeros(4)
+    scratch = History(np.array([20.0, 40.0, 60.0, 80.0]), minutes, np.array([np.nan, 1.0, 3.0, 9.0]))
+    mine = History(np.array([10.0, 20.0, 30.0, 40.0]), minutes, np.array([2.0, np.nan, 3.0, 1.0]))
+    np.testing.assert_allclose(needed(mine, scratch), [np.nan, 10 / 40, 30 / 60, np.nan])
+    np.testing.assert_allclose(needed(scratch, scratch)[1:], 1)
+
+
 def test_figure_5_2_draws_means_spreads_and_bars(tmp_path):
     steps, minutes = np.array([1e6, 2e6]), np.array([1.0, 3.0])
     curves = {
-        "scratch": [History(steps, minutes, np.array([0.0, 2.0])), History(steps, minutes, np.array([2.0, 6.0]))],
-        "mode 0, 10k": [History(steps, minutes, np.array([5.0, 5.0]))],
+        "scratch": {
+            0: History(steps, minutes, np.array([0.0, 2.0])),
+            1: History(steps, minutes, np.array([2.0, 6.0])),
+        },
+        "mode 0, 10k": {0: History(steps / 2, minutes, np.array([1.0, 5.0]))},
     }
     curves["mode 0, longer"] = curves["mode 0, 10k"]
     figure = return_history(curves, {"expert": [0.25], "mode 0": [1.0, 2.0]}, note="seeds 0, 1")
@@ -132,8 +145,12 @@ def test_figure_5_2_draws_means_spreads_and_bars(tmp_path):
     assert styles == {"scratch": "-", "mode 0, 10k": "--", "mode 0, longer": ":"}
     for values in line(figure, "scratch"):
         np.testing.assert_allclose(values[[0, -1]], [1, 4])
-    assert len(line(figure, "scratch")) == len(line(figure, "mode 0, 10k")) == 2
-    heights = [patch.get_height() for patch in figure.axes[2].patches if isinstance(patch, Rectangle)]
+    assert len(line(figure, "scratch")) == 2
+    assert len(line(figure, "mode 0, 10k")) == 3
+    shares = {one.get_gid(): one for one in figure.axes[2].lines}
+    assert "scratch" not in shares
+    np.testing.assert_allclose(shares["mode 0, 10k"].get_ydata()[[0, -1]], [0.5, 0.5])
+    heights = [patch.get_height() for patch in figure.axes[3].patches if isinstance(patch, Rectangle)]
     np.testing.assert_allclose(heights, [0.25, 1.5])
     assert all(drawn(path) for path in write(tmp_path, "f", figure) if path.suffix == ".png")
     with pytest.raises(SpecError, match="curves"):

@@ -1,7 +1,7 @@
 """Repair as a whole: linearisation, sequential programs, distillation, the counter-example loop, verification."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -20,6 +20,7 @@ from gnn.decode import Integrator
 from gnn.freeze import paths_of
 from repair.config import ConstraintConfig, DescentConfig, LoopConfig
 from repair.constraints.barrier import Barrier
+from repair.constraints.constraint import HalfPlanes
 from repair.constraints.disc import Disc
 from repair.descend import Lessons, Pool
 from repair.encounters import encounters
@@ -184,6 +185,39 @@ def test_contradictory_rows_are_elastic_and_named_so():
     found = relax(question, m.params, FreeWeights.matching(m.params, READOUT), Relaxation(steps=4))
     assert found.status is Status.ELASTIC
     assert found.violated == 1
+
+
+@dataclass(frozen=True)
+class Lane:
+    """The first component between 1 and 1 + `width` m/s^2."""
+
+    width: float
+    name = "lane"
+    unit = "m/s^2"
+
+    def half_planes(self, e, action) -> HalfPlanes:
+        rows = np.ones(len(action))
+        normal = np.stack([np.stack([rows, 0 * rows], axis=-1), np.stack([-rows, 0 * rows], axis=-1)], axis=1)
+        return HalfPlanes(normal=normal, offset=np.stack([rows, -(1 + self.width) * rows], axis=1))
+
+    def slack(self, e, action):
+        planes = self.half_planes(e, action)
+        return np.sum(planes.normal * action[:, None], axis=-1) - planes.offset
+
+    def sides(self, e) -> None:
+        return None
+
+
+def test_rows_with_less_room_than_the_margin_are_mended_all_the_same():
+    """A margin of 0.02 on both sides does not fit into a lane of 0.01."""
+    m = model()
+    limitless = replace(MOTION, max_acceleration=np.inf)
+    question = replace(problem(m, Lane(0.01)), kinematics=limitless, constrained=approaching(3))
+    found = relax(question, m.params, FreeWeights.matching(m.params, READOUT), Relaxation(price=100.0))
+    assert found.status is Status.FEASIBLE
+    inside = question.act(found.params, question.constrained)[:, 0]
+    assert (inside > 1 - 1e-4).all()
+    assert (inside < 1.01 + 1e-4).all()
 
 
 def test_a_time_limit_of_zero_changes_nothing():

@@ -45,6 +45,12 @@ def test_a_bad_value_is_refused_with_field_given_and_allowed(field: str, value: 
     assert isinstance(error, ValueError)
 
 
+def test_only_bodies_that_there_are_must_fit_into_the_arena():
+    assert SceneSpec(num_obstacles=0, arena=5.0).obstacle_radius == 7.0
+    assert refused(num_obstacles=1, arena=5.0).field == "obstacle_radius"
+    assert refused(num_obstacles=0, arena=0.5).field == "agent_radius"
+
+
 def test_a_value_of_a_wrong_type_is_refused_too():
     """In a process of its own: here the type checker of the tests would be faster."""
     switches = [field.name for field in dataclasses.fields(SceneSpec) if isinstance(field.default, bool)]

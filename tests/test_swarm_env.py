@@ -60,6 +60,16 @@ def test_clipping_is_differentiable_at_zero():
     assert np.isfinite(gradient(jnp.array([[30.0, 40.0]]))).all()
 
 
+def test_clipping_survives_numbers_whose_squares_overflow():
+    """3-4-5 triangles of any size: the direction is kept, and what is short enough is kept bit for bit."""
+    for size in (2.0, 1e10, 1e25, 6e37):
+        found = np.asarray(clip_norm(jnp.array([[3 * size, -4 * size]], jnp.float32), 5.0))
+        np.testing.assert_allclose(found, [[3.0, -4.0]], rtol=1e-6)
+        assert np.isfinite(jax.grad(lambda v: clip_norm(v, 5.0).sum())(jnp.array([[3 * size, -4 * size]]))).all()
+    short = np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)
+    np.testing.assert_array_equal(jax.jit(lambda v: clip_norm(v, 10.0))(short), short)
+
+
 def test_a_free_step_is_free_flight_and_counts_itself(env: SwarmEnv):
     state = at_rest(velocity=[[1, 2], [3, -1], [0, 0]])
     u = np.array([[[1, 0], [0, 2], [-3, 1]]], np.float32)

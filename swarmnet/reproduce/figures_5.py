@@ -250,7 +250,7 @@ def draw_5_2(folder: Path, done: Sequence[tuple[Cell, dict]]) -> list[Path]:
         events.setdefault(name, []).append(record["values"][f"{cell.data}: {EVENTS}"])
         if cell.row in FREEZE:
             rows = read_metrics(cell.path(folder.parent / "policies") / "metrics.jsonl")
-            curves.setdefault(name, []).append(history(rows))
+            curves.setdefault(name, {})[cell.seed] = history(rows)
     trained = [(cell, record) for cell, record in done if cell.row in FREEZE]
     seeds = sorted({cell.seed for cell, _ in trained})
     both = any(cell.data == MANY for cell, _ in trained)
