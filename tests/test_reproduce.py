@@ -21,7 +21,7 @@ from swarmnet.commands import reproduce as command
 from swarmnet.config import Reproduce
 from swarmnet.reproduce import table_4_1
 from swarmnet.reproduce.borrow import Learning
-from swarmnet.reproduce.cells import read_record, records, run_cells
+from swarmnet.reproduce.cells import read_record, records, run_cells, write_record
 from swarmnet.reproduce.experiment import PROFILES, REGISTRY, Cell, DataSet, Effort, Experiment, find
 from swarmnet.reproduce.lock import Busy, locked
 from swarmnet.reproduce.merge import merge, table
@@ -140,6 +140,23 @@ def test_a_cell_that_another_process_works_on_is_left_to_it(fake: Fake, tmp_path
     assert cells[1] not in fake.calls
     assert run_cells(fake.experiment, cells, EFFORT, tmp_path).busy == ()
     assert cells[1] in fake.calls
+
+
+def test_a_cell_that_has_just_failed_elsewhere_is_not_tried_again(fake: Fake, tmp_path: Path, monkeypatch):
+    """As if a second job had failed at the second cell while this one did the first."""
+    cells, run = fake.experiment.cells((0,)), fake.run
+
+    def run_beside(cell: Cell, effort: Effort, folder: Path, progress) -> dict[str, float]:
+        if cell == cells[0]:
+            cells[1].path(tmp_path).mkdir(parents=True)
+            write_record(cells[1].path(tmp_path), {"failed": "the loss is nan", "seed": 0})
+        return run(cell, effort, folder, progress)
+
+    monkeypatch.setattr(fake, "experiment", replace(fake.experiment, run=run_beside))
+    outcome = run_cells(fake.experiment, cells[:3], EFFORT, tmp_path)
+    assert (outcome.done, outcome.failed) == ((cells[0], cells[2]), (cells[1],))
+    assert fake.calls == [cells[0], cells[2]]
+    assert run_cells(fake.experiment, cells[1:2], EFFORT, tmp_path).done == (cells[1],)
 
 
 def test_two_processes_share_the_cells_and_do_each_once(tmp_path: Path):

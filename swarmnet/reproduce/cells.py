@@ -48,13 +48,15 @@ def run_cells(
     Raises SwarmError for a folder whose cells were run with another effort.
     """
     claim(folder, effort)
+    had = {cell: read_record(cell.path(folder)) for cell in cells}
     done, failed, busy = [], [], []
     for number, cell in enumerate(cells, 1):
         place, title = cell.path(folder), f"{number}/{len(cells)} {experiment.name}: {cell}"
         try:
             with locked(place / "cell.lock"):
                 record = read_record(place)
-                if record is None or "failed" in record:
+                # What has failed since the beginning, another job has just tried.
+                if record is None or ("failed" in record and record == had[cell]):
                     with bar(title) as update:
                         record = run_cell(experiment, cell, effort, place, update)
                     write_record(place, record)
