@@ -110,7 +110,7 @@ OTHERS = {
     "20 agents": replace(THESIS, num_agents=20),
     "3 obstacles": replace(THESIS, num_obstacles=3),
 }
-"""Scenes that no repair acted in, but for those of the loop in crowds."""
+"""Other kinds of scenes: the loop acts among 3 to 5 agents and 1 to 3 obstacles, the loop in crowds among 3 to 20."""
 
 
 def learned_from(effort: Effort) -> int:
