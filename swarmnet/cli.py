@@ -70,8 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     except OSError as error:
         return _fail(f"{error.filename or ''}: {error.strerror or error}".lstrip(": "))
-    except RuntimeError as error:
-        # What an engine raises inside a compiled function reaches us as text at the end of JAX's own error.
+    except (RuntimeError, ValueError) as error:
+        # What an engine raises inside a compiled function reaches us as text at the end of one of JAX's errors.
         _, raised, message = str(error).rpartition("EngineError: ")
         if not raised:
             raise

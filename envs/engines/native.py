@@ -1,10 +1,10 @@
-"""MuJoCo's C engine on a thread pool (`mujoco.batch`) behind `jax.pure_callback`: the default on a CPU."""
+"""MuJoCo's C engine on a thread pool (`mujoco.batch`), called from compiled functions: the default on a CPU."""
 
 import collections
 import contextlib
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from mujoco.batch import Batch, SimulationError
 
 from envs.dynamics import free_flight
 from envs.engines.engine import EngineError, obstacle_path, read_sensors, with_obstacles_moved
+from envs.engines.host import filled
 from envs.record import Array
 from envs.state import Contacts, State, no_contacts
 from swarm_mjcf.build import compile_physics
@@ -30,6 +31,11 @@ _COUNTS = ("agent_states", "obstacle_states", "wall_states", "agent_events", "ob
 _DEPTHS = ("agent_depth", "obstacle_depth", "wall_depth")
 
 
+def _like(tree: Any) -> Any:
+    """Shapes of arrays."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+
+
 @dataclass
 class _Worker:
     """Two batches of the same scenes, one that moves and one that looks, and recording buffers: what a call holds."""
@@ -39,8 +45,8 @@ class _Worker:
     records: dict = field(default_factory=dict)
 
 
-def _bodies_of(model: mujoco.MjModel, spec: SceneSpec) -> slice:
-    """Columns of a batch's state rows that hold qpos, qvel, qacc_warmstart and ctrl, one after the other."""
+def _columns(model: mujoco.MjModel, spec: SceneSpec) -> tuple[slice, slice, slice, slice]:
+    """Columns of a batch's state rows that hold qpos, qvel, qacc_warmstart and ctrl."""
 
     def start(component: mujoco.mjtState) -> int:
         # A row has the components in the order of their bits.
@@ -48,23 +54,11 @@ def _bodies_of(model: mujoco.MjModel, spec: SceneSpec) -> slice:
         return mujoco.mj_stateSize(model, before)
 
     state, n = mujoco.mjtState, 2 * spec.num_agents
-    first = start(state.mjSTATE_QPOS)
     order = (state.mjSTATE_QPOS, state.mjSTATE_QVEL, state.mjSTATE_WARMSTART, state.mjSTATE_CTRL)
-    if [start(part) for part in order] != [first, first + n, first + 2 * n, first + 3 * n]:
-        raise RuntimeError("this MuJoCo lays out the state of a batch in another order than 3.17 does")
-    return slice(first, first + 4 * n)
-
-
-def _rows(*parts: Array) -> Array:
-    """Arrays (S, ...) as one (S, W) of the first one's dtype."""
-    return jnp.concatenate([part.reshape(len(part), -1).astype(parts[0].dtype) for part in parts], axis=1)
-
-
-def _parts(rows: Array, *shapes: tuple[int, ...]) -> list:
-    """The arrays (S, *shape) that make up (S, W); all of them views where `rows` is of NumPy."""
-    ends = np.cumsum([math.prod(shape) for shape in shapes])
-    columns = [rows[:, end - math.prod(shape) : end] for end, shape in zip(ends, shapes, strict=True)]
-    return [part.reshape(len(rows), *shape) for part, shape in zip(columns, shapes, strict=True)]
+    if any(mujoco.mj_stateSize(model, int(part)) != n for part in order):
+        raise RuntimeError("this MuJoCo lays out the state of a batch otherwise than 3.17 does")
+    qpos, qvel, warmstart, ctrl = (slice(start(part), start(part) + n) for part in order)
+    return qpos, qvel, warmstart, ctrl
 
 
 class NativeEngine:
@@ -86,55 +80,45 @@ class NativeEngine:
         if spec.substeps == 1:
             self._mover.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._index = SceneIndex.of(self._model, spec)
-        self._bodies = _bodies_of(self._model, spec)
-        agents = spec.num_agents
-        # Columns of a state that hold qpos and qvel.
-        self._moved = slice(self._bodies.start, self._bodies.start + 4 * agents)
-        # What a control step gives: position, velocity, touching flags (agent, wall, obstacle), counts, depths.
-        flags = ((agents,), (agents,), (agents, spec.num_obstacles))
-        self._seen = ((agents, 2), (agents, 2), *flags, (len(_COUNTS), agents), (len(_DEPTHS), agents))
+        self._qpos, self._qvel, self._warmstart, self._ctrl = _columns(self._model, spec)
         self._pool: dict[int, collections.deque[_Worker]] = collections.defaultdict(collections.deque)
 
     def step(self, state: State, acceleration: Float[Array, "S N 2"]) -> tuple[State, Contacts]:
         """One control step of `substeps` physics steps; contacts of states 1..k."""
-        scenes, agents, _ = state.position.shape
         spec = self.spec
-        # One array crosses the border each way: what an array costs there is more than its copy. First the bodies as
-        # MuJoCo lays them out (qpos, qvel, warm start, ctrl).
-        bodies = (state.position, state.velocity, jnp.zeros_like(state.position), acceleration)
         path = obstacle_path(state, spec)
         after = with_obstacles_moved(state, path, spec)
-
-        def called(function: Callable[[Array], np.ndarray], rows: Array, width: int) -> Array:
-            shape = jax.ShapeDtypeStruct((scenes, width), rows.dtype)
-            return jax.pure_callback(function, shape, rows, vmap_method="sequential")
-
+        bodies = (state.position, state.velocity, acceleration)
         if not spec.contacts:
-            out = called(self._advance, _rows(*bodies, state.obstacle), 4 * agents)
-            position, velocity = _parts(out, (agents, 2), (agents, 2))
-            return replace(after, position=position, velocity=velocity), no_contacts(scenes, agents)
+            moved = filled(self._advance, _like(bodies[:2]), *bodies, state.obstacle)
+            after = replace(after, position=moved[0], velocity=moved[1])
+            return after, no_contacts(*state.position.shape[:2])
         if not spec.moving_obstacles:
             path = path[:, :1]  # placed once, for all substeps
         flags = (state.touching_agent, state.touching_wall, state.touching_obstacle)
-        rows = _rows(*bodies, path, self._near(after, acceleration), *flags)
-        out = called(self._advance_with_contacts, rows, sum(math.prod(shape) for shape in self._seen))
-        position, velocity, agent, wall, obstacle, counts, depths = _parts(out, *self._seen)
+        contacts = no_contacts(*state.position.shape[:2])
+        seen = {name: getattr(contacts, name) for name in _COUNTS + _DEPTHS}
+        moved, flags, seen = filled(
+            self._advance_with_contacts, _like((bodies[:2], flags, seen)), *bodies, path,
+            self._near(after, acceleration), *flags,
+        )  # fmt: skip
+        agent, wall, obstacle = flags
         after = replace(
             after,
-            position=position,
-            velocity=velocity,
-            touching_agent=agent > 0,
-            touching_wall=wall > 0,
-            touching_obstacle=obstacle > 0,
+            position=moved[0],
+            velocity=moved[1],
+            touching_agent=agent,
+            touching_wall=wall,
+            touching_obstacle=obstacle,
         )
-        fields = {name: counts[:, i].astype(jnp.int32) for i, name in enumerate(_COUNTS)}
-        fields |= {name: depths[:, i].astype(jnp.float32) for i, name in enumerate(_DEPTHS)}
-        return after, Contacts(**fields, saturated=jnp.zeros(scenes, jnp.int32))
+        return after, replace(contacts, **seen)
 
     @contextlib.contextmanager
-    def _loaded(self, bodies: np.ndarray, obstacle: np.ndarray) -> Iterator[_Worker]:
-        """A worker whose batch holds the given states and controls (S, 8N); back in the pool afterwards."""
-        scenes = bodies.shape[0]
+    def _loaded(
+        self, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, obstacle: np.ndarray
+    ) -> Iterator[_Worker]:
+        """A worker whose batch holds the given states and controls (S, N, 2); back in the pool afterwards."""
+        scenes = len(position)
         pool, index = self._pool[scenes], self._index
         try:
             worker = pool.popleft()  # atomic: a deque is safe between threads
@@ -144,7 +128,10 @@ class NativeEngine:
             worker.batch.bind("ncon")
             worker.look.bind("sensordata")
         batch = worker.batch
-        batch.state[:, self._bodies] = bodies
+        state = batch.state
+        for columns, values in ((self._qpos, position), (self._qvel, velocity), (self._ctrl, acceleration)):
+            state[:, columns] = values.reshape(scenes, -1)
+        state[:, self._warmstart] = 0
         batch.mocap_pos[:, index.obstacle_mocap, :2] = obstacle
         try:
             yield worker
@@ -173,21 +160,36 @@ class NativeEngine:
         places[:, :, self._index.obstacle_mocap, :2] = path[:, :-1]
         return places.reshape(*places.shape[:2], -1)
 
-    def _advance(self, rows: Array) -> np.ndarray:
-        agents, obstacles = self.spec.num_agents, self.spec.num_obstacles
-        bodies, obstacle = _parts(np.asarray(rows), (8 * agents,), (obstacles, 2))
-        with self._loaded(bodies, obstacle) as worker:
-            worker.batch.step(nstep=self.spec.substeps)
-            return worker.batch.state[:, self._moved].astype(rows.dtype)
+    def _give(self, batch: Batch, moved: tuple[np.ndarray, np.ndarray]) -> None:
+        for columns, values in zip((self._qpos, self._qvel), moved, strict=True):
+            values.reshape(len(values), -1)[:] = batch.state[:, columns]
 
-    def _advance_with_contacts(self, rows: Array) -> np.ndarray:
+    def _advance(
+        self,
+        out: tuple[np.ndarray, np.ndarray],
+        position: np.ndarray,
+        velocity: np.ndarray,
+        acceleration: np.ndarray,
+        obstacle: np.ndarray,
+    ) -> None:
+        with self._loaded(position, velocity, acceleration, obstacle) as worker:
+            worker.batch.step(nstep=self.spec.substeps)
+            self._give(worker.batch, out)
+
+    def _advance_with_contacts(
+        self,
+        out: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, ...], dict[str, np.ndarray]],
+        position: np.ndarray,
+        velocity: np.ndarray,
+        acceleration: np.ndarray,
+        path: np.ndarray,
+        near: np.ndarray,
+        *before: np.ndarray,
+    ) -> None:
         k, index, spec = self.spec.substeps, self._index, self.spec
-        agents, obstacles = spec.num_agents, spec.num_obstacles
-        instants = k + 1 if spec.moving_obstacles else 1
-        flags = ((agents,), (agents,), (agents, obstacles))
-        bodies, path, near, *before = _parts(np.asarray(rows), (8 * agents,), (instants, obstacles, 2), (), *flags)
-        scenes = len(bodies)
-        with self._loaded(bodies, path[:, 0]) as worker:
+        scenes = len(position)
+        moved, flags, seen = out
+        with self._loaded(position, velocity, acceleration, path[:, 0]) as worker:
             batch, look = worker.batch, worker.look
             if k == 1:
                 batch.step()
@@ -199,23 +201,25 @@ class NativeEngine:
                 # A record describes the state before its substep: sensors 1.. are those of states 1..k-1.
                 recorded, positions = worker.records["sensordata"][:, 1:], worker.records["qpos"]
                 touched = worker.records["ncon"].reshape(scenes, k).any(axis=1)
+            self._give(batch, moved)
             # Scenes where nothing touches, most of them, are done: zeros.
-            out = np.zeros((scenes, sum(math.prod(shape) for shape in self._seen)), rows.dtype)
-            out[:, : 4 * agents] = batch.state[:, self._moved]
+            for values in (*flags, *seen.values()):
+                values.fill(0)
             if spec.moving_obstacles:
                 batch.mocap_pos[:, index.obstacle_mocap, :2] = path[:, k]
-            chosen = np.flatnonzero(touched | (near > 0))
+            chosen = np.flatnonzero(touched | near)
             if len(chosen):
                 look.state[chosen] = batch.state[chosen]
                 look.forward(ids=chosen, stage=mujoco.mjtStage.mjSTAGE_POS.value)  # state k
                 sensors = np.concatenate([recorded[chosen], look.sensordata[chosen, None]], axis=1)
-                agent, wall, obstacle = (flag[chosen] > 0 for flag in before)
-                now, on_agent, fields = read_sensors(np, sensors, (agent, obstacle, wall), index, spec)
-                fields["agent_depth"] = self._agent_depth(on_agent, positions, chosen)
+                agent, wall, obstacle = (flag[chosen] for flag in before)
+                now, on_agent, found = read_sensors(np, sensors, (agent, obstacle, wall), index, spec)
+                found["agent_depth"] = self._agent_depth(on_agent, positions, chosen)
                 agent, obstacle, wall = now
-                seen = [agent, wall, obstacle, *(fields[name] for name in _COUNTS + _DEPTHS)]
-                out[chosen, 4 * agents :] = np.concatenate([x.reshape(len(chosen), -1) for x in seen], axis=1)
-        return out
+                for values, there in zip(flags, (agent, wall, obstacle), strict=True):
+                    values[chosen] = there
+                for name, values in seen.items():
+                    values[chosen] = found[name]
 
     def _near(self, state: State, acceleration: Float[Array, "S N 2"]) -> Bool[Array, " S"]:
         """Whether two bodies may touch at state k if none does before; where not, all its sensors are zero for sure."""
