@@ -2,6 +2,7 @@
 
 from typing import Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -31,7 +32,8 @@ def clip_norm(vector: Float[Array, "*n 2"], limit: float) -> Float[Array, "*n 2"
     if limit == float("inf"):
         return vector
     # Squares of what a repulsive force can be overflow; whatever is shorter stays bit for bit.
-    vector = vector / jnp.maximum(jnp.abs(vector).max(axis=-1, keepdims=True) / _SQUARABLE, 1)
+    largest = jnp.maximum(jnp.abs(vector[..., :1]), jnp.abs(vector[..., 1:]))
+    vector = vector * jax.lax.stop_gradient(jnp.minimum(_SQUARABLE / largest, 1))
     square = jnp.sum(vector * vector, axis=-1, keepdims=True)
     long = square > limit * limit
     return vector * jnp.where(long, limit / jnp.sqrt(jnp.where(long, square, 1)), 1)
