@@ -12,13 +12,15 @@ from envs.record import Array
 from envs.state import State
 from gnn.graph import graph_of_state
 from repair.constraints.constraint import Constraint, HalfPlanes
-from repair.encounters import Bodies, encounters
+from repair.encounters import Bodies, Encounters, encounters, length
 from repair.network import Situations
 
 TIGHTEST = 8
 """Conditions of an agent whose lines are tried, those with the least slack; all of them are checked."""
 MORE = 3
 """Times that the lines are chosen anew where there are more conditions."""
+DIRECTIONS, LOOK, FINE = 36, 4, 6
+"""Where no action is allowed: directions that are tried, for how many control steps, and looks at each of them."""
 TOLERANCE = 1e-4
 """By how much an action may violate a condition and still count as allowed [m/s^2]."""
 
@@ -115,6 +117,49 @@ def safe_actions(
     return safe, possible
 
 
+def evasive(
+    constraint: Constraint, e: Encounters, action: Float[Array, "R 2"], kinematics: Kinematics
+) -> Float[Array, "R 2"]:
+    """The action that, held on to, keeps the nearest body farthest away [m/s^2]: for who has no allowed one.
+
+    Braking along the line of centres may come too late where a turn does not. Tried are `action` and the full
+    acceleration in `DIRECTIONS` directions for `LOOK` control steps; the other agent of a pair is taken to do the
+    opposite, as it finds the same by the same rule. Of many bodies the `TIGHTEST` of least slack count.
+    """
+    xp = action.__array_namespace__()
+    bodies = min(TIGHTEST, e.present.shape[1])
+    order = xp.argsort(xp.where(e.present, constraint.slack(e, action), np.inf), axis=1)[:, :bodies]
+    position, velocity = (xp.take_along_axis(x, order[..., None], axis=1) for x in (e.relative, e.velocity))
+    reach, here, steers = (xp.take_along_axis(x, order, axis=1) for x in (e.reach, e.present, e.steers))
+    angle = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
+    rim = kinematics.max_acceleration * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rim = xp.broadcast_to(xp.asarray(rim, dtype=action.dtype), (len(action), DIRECTIONS, 2))
+    tried = xp.concatenate([action[:, None], rim], axis=1)
+    push = xp.where(steers, 2.0, 1.0)[:, None, :, None] * tried[:, :, None]  # of the agent seen from the body
+    nearest = xp.full(tried.shape[:2], np.inf, dtype=action.dtype)
+    for time in kinematics.dt * np.arange(1, LOOK * FINE + 1) / FINE:
+        away = length((position + velocity * time)[:, None] + push * (time * time / 2)) - reach[:, None]
+        nearest = xp.minimum(nearest, xp.min(xp.where(here[:, None], away, np.inf), axis=-1))
+    best = xp.argmax(nearest, axis=1)
+    return xp.take_along_axis(tried, best[:, None, None], axis=1)[:, 0]
+
+
+def shielded(
+    constraint: Constraint,
+    situations: Situations,
+    action: Float[Array, "R 2"],
+    bodies: Bodies,
+    kinematics: Kinematics,
+) -> Float[Array, "R 2"]:
+    """What the filter makes of executed actions [m/s^2]: the nearest allowed one, `evasive` where there is none."""
+    safe, possible = safe_actions(constraint, situations, action, bodies, kinematics)
+    e = encounters(situations, bodies)
+    if not e.present.shape[1] or np.isinf(kinematics.max_acceleration):
+        return safe
+    xp = action.__array_namespace__()
+    return xp.where(possible[:, None], safe, evasive(constraint, e, safe, kinematics))
+
+
 def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:
     return present[:, :, None] & present[:, None] & ~jnp.eye(present.shape[1], dtype=bool)
 
@@ -131,17 +176,18 @@ def make_filtered(
         _, obstacles, _ = graph.counts
         first = nodes.shape[1] - agents
         parts = {"obstacle": nodes[:, first - obstacles : first], "agent": nodes[:, first:]}
+        own = nodes[:, first:].reshape(-1, 4)
         situations = Situations(
-            own=nodes[:, first:].reshape(-1, 4),
+            own=own,
             senders={name: jnp.repeat(part, agents, axis=0) for name, part in parts.items()},
             present={
-                "obstacle": jnp.asarray(graph.obstacle).reshape(-1, obstacles),
+                "obstacle": jnp.asarray(graph.obstacle).reshape(len(own), obstacles),
                 # Everybody else, also where the network hears of its target alone.
-                "agent": _others(jnp.asarray(graph.present)[:, first:]).reshape(-1, agents),
+                "agent": _others(jnp.asarray(graph.present)[:, first:]).reshape(len(own), agents),
             },
         )
         flat = limited(situations.own[:, 2:], jnp.asarray(wanted).reshape(-1, 2), kinematics)
-        safe, _ = safe_actions(constraint, situations, flat, bodies, kinematics)
+        safe = shielded(constraint, situations, flat, bodies, kinematics)
         safe = jnp.asarray(safe).reshape(wanted.shape)
         return jnp.where(jnp.asarray(state.agent_present)[..., None], safe, wanted)
 

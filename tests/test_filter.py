@@ -10,14 +10,26 @@ import pytest
 from helpers import scene_state
 
 from envs.rollout import make_rollout
+from envs.state import State
 from envs.swarm_env import SwarmEnv, scene_keys
 from repair.config import ConstraintConfig
 from repair.constraints.barrier import Barrier
 from repair.constraints.constraint import HalfPlanes
 from repair.constraints.disc import Disc
 from repair.constraints.registry import make_constraint
-from repair.encounters import encounters
-from repair.filter import TIGHTEST, TOLERANCE, make_filtered, nearest_allowed, safe_actions
+from repair.encounters import Encounters, encounters
+from repair.filter import (
+    DIRECTIONS,
+    FINE,
+    LOOK,
+    TIGHTEST,
+    TOLERANCE,
+    evasive,
+    make_filtered,
+    nearest_allowed,
+    safe_actions,
+    shielded,
+)
 from repair.network import situations_of_state
 from swarm_mjcf.spec import SceneSpec
 
@@ -207,6 +219,73 @@ def test_chasers_are_kept_from_everybody_and_not_from_their_target_alone():
     keep = make_filtered(lambda *_: jnp.zeros((1, 3, 2)), Barrier(kinematics=SPEC), SPEC, SPEC)
     np.testing.assert_array_equal(keep(chased, None), keep(state, None))
     assert float(jnp.abs(keep(chased, None)[0, 1]).max()) > 1
+
+
+def crossing(rows: int, seed: int) -> State:
+    """Two agents, mostly too near and too fast to stop before each other or the obstacle."""
+    rng = np.random.default_rng(seed)
+    near = np.stack([rng.uniform(4, 8, rows), rng.uniform(-2.5, 2.5, rows)], axis=-1)
+    fast = np.stack([-rng.uniform(5, 10, rows), rng.uniform(-1, 1, rows)], axis=-1)
+    return scene_state(
+        replace(SPEC, num_agents=2, num_obstacles=1),
+        np.stack([np.zeros((rows, 2)), near], axis=1),
+        np.stack([-fast, fast], axis=1),
+        obstacle=np.stack([np.full(rows, 1.0), np.where(np.arange(rows) % 2, 14.0, 80.0)], axis=-1)[:, None],
+        obstacle_present=np.ones((rows, 1), bool),
+    )
+
+
+def clearance(e: Encounters, row: int, action: np.ndarray) -> float:
+    """How near any body comes in `LOOK` control steps of one action, the other agent of a pair doing the opposite."""
+    worst = np.inf
+    for body in range(e.present.shape[1]):
+        push = action * (2 if e.steers[row, body] else 1)
+        for time in SPEC.dt * np.arange(1, LOOK * FINE + 1) / FINE:
+            at = e.relative[row, body] + e.velocity[row, body] * time + push * time**2 / 2
+            worst = min(worst, np.hypot(*at) - e.reach[row, body])
+    return worst
+
+
+def test_who_cannot_brake_in_time_turns_where_it_stays_farthest_away():
+    e = encounters(situations_of_state(crossing(30, 0)), SPEC)
+    rng = np.random.default_rng(1)
+    given = rng.normal(0, 3, (60, 2))
+    found = evasive(Barrier(kinematics=SPEC), e, given, SPEC)
+    angle = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
+    rim = SPEC.max_acceleration * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    for row in range(60):
+        values = [clearance(e, row, tried) for tried in (given[row], *rim)]
+        assert clearance(e, row, found[row]) == pytest.approx(max(values), abs=1e-9)
+
+
+def test_only_who_has_no_allowed_action_is_turned_and_both_of_a_pair_alike():
+    state = crossing(40, 2)
+    state = replace(state, obstacle_present=np.zeros((40, 1), bool))
+    s, barrier = situations_of_state(state), Barrier(kinematics=SPEC)
+    wanted = np.zeros((80, 2))
+    safe, possible = safe_actions(barrier, s, wanted, SPEC, SPEC)
+    found = shielded(barrier, s, wanted, SPEC, SPEC)
+    assert 10 < possible.sum() < 70
+    np.testing.assert_array_equal(found[possible], safe[possible])
+    turned = found[~possible].reshape(-1, 2, 2)  # both of a pair meet the same
+    np.testing.assert_allclose(turned[:, 0], -turned[:, 1], atol=1e-9)
+    assert np.abs(turned - safe[~possible].reshape(-1, 2, 2)).max() > 1
+
+
+def test_a_turn_saves_in_physics_whom_brakes_do_not(monkeypatch):
+    """6.2 m apart at 19 m/s: brakes need 9 m, a turn adds a metre to the 1.5 that they pass each other at."""
+    spec = replace(SPEC, num_agents=2, num_obstacles=0)
+    start = scene_state(
+        spec, np.array([[[0.0, 0], [6.2, 1.5]]]), np.array([[[9.5, 0], [-9.5, 0]]]), goal=np.array([[50.0, 50.0]])
+    )
+    barrier, env = Barrier(kinematics=spec), SwarmEnv(spec, engine="native", horizon=8)
+
+    for touching in (False, True):
+        if touching:
+            monkeypatch.setattr("repair.filter.evasive", lambda constraint, e, action, kinematics: action)
+        policy = make_filtered(lambda state, *_: jnp.zeros((1, 2, 2)), barrier, spec, spec)
+        recording = jax.device_get(make_rollout(env, policy, steps=8)(None, start, scene_keys(0, np.arange(1))))
+        assert bool(recording.contacts.agent_states.any()) == touching
 
 
 def test_absent_agents_keep_their_action():

@@ -21,7 +21,7 @@ from swarmnet.figures import MODEL
 from swarmnet.figures_repair import FLOOR, make_repair_figures, pareto, repair_rounds
 from swarmnet.reproduce import table_6_1 as table
 from swarmnet.reproduce.experiment import Cell, find
-from swarmnet.reproduce.table_6_1 import TABLE_6_1, beside, draw_6_1, outcome, squared, thesis_figures
+from swarmnet.reproduce.table_6_1 import TABLE_6_1, beside, draw_6_1, many, outcome, squared, thesis_figures
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -66,6 +66,22 @@ def test_contacts_by_hand():
     assert thesis_figures(made_up()) == (25, 50)
     assert set(found) < set(table.MAIN)
     assert {*found, table.RATIO, table.AWAY} >= set(table.ELSEWHERE)
+
+
+def test_contacts_of_many_trajectories_by_hand():
+    """Scene 0 touches, and everybody begins on the same spot; in scene 1 they begin apart."""
+    world = table.THESIS.world()
+    acted = made_up()
+    acted.nodes[1, 0, 1, 0], acted.nodes[1, 0, 3, 1] = 50.0, 9.0
+    one = many(acted, world)
+    names = (table.TOUCHED, table.LOST, table.AVOIDED)
+    assert [one[f"{table.MANY}: {name}"] for name in names] == [1, 1, 0]
+    assert one[f"{table.MANY}: {table.AT_MOST}"] == pytest.approx(95)  # 0 of 1
+    acted.touching_agent[1, 3, 0] = True
+    two = many(acted, world)
+    assert [two[f"{table.MANY}: {name}"] for name in names] == [2, 1, 1]
+    assert two[f"{table.MANY}: {table.AT_MOST}"] == 100
+    assert set(two) == set(table.OF_MANY)
 
 
 def test_ratios_to_the_imitation_policy():
@@ -129,9 +145,10 @@ def test_which_cells_there_are():
     certified = {"imitation", "counter-example loop"}
     everywhere = certified | {"expert", "loop in crowds", "filter", "repaired + filter"}
     for row in table.ROWS:
-        for data in ("thesis", "certificate", "10 agents", "20 agents", "3 obstacles"):
+        for data in ("thesis", "certificate", "10,000 trajectories", "10 agents", "20 agents", "3 obstacles"):
             seeds = {cell.seed for cell in cells if (cell.row, cell.data) == (row, data)}
             there = data == "thesis" or row in (certified if data == "certificate" else everywhere)
+            there &= (row, data) != ("loop in crowds", "10,000 trajectories")
             assert seeds == (({0} if row == "expert" else {0, 1, 2}) if there else set()), (row, data)
     assert (cells[0].row, cells[1].row) == ("imitation", "imitation")  # whom all others need comes first
     columns = [column for data in TABLE_6_1.data_sets for column in data.columns]
