@@ -20,8 +20,9 @@ from repair.constraints.disc import Disc
 from repair.descend import Descent, Lessons, Pool
 from repair.encode import encode
 from repair.encounters import Bodies, encounters
+from repair.layerwise import layerwise
 from repair.linearise import FreeWeights, Linearised
-from repair.network import Situations, actions, check_encodable
+from repair.network import Situations, actions, check_encodable, concatenate
 from repair.problem import Problem
 from repair.relax import Relaxation, SequentialProblem, relax
 from repair.screen import decisions, screen
@@ -40,6 +41,8 @@ MARGINS, ROWS = (0.0, 0.1, 0.5), (500, 1000, 2000, 5000)
 EDGE_BOXES, EDGE_ROWS = (0.005, 0.01, 0.02, 0.05), (5, 10, 20, 40)
 THESIS_BOXES, THESIS_ROWS = (0.1, 0.3, 1.0), (500, 5000)
 """Boxes: how far a weight may go. Rows: agents that decide; 5000 are those of the thesis's 1000 states."""
+ROTATION_BOX, ROTATION_ROWS, TURNS = 0.02, (10, 20, 40), 4
+"""The rotation over layers: rows, of which half break the barrier, and rounds at most."""
 SCENES, STEPS, SEED = 512, 50, 3_000_000
 """Of roll-outs."""
 PRICE = 1.0
@@ -80,6 +83,27 @@ class Part:
 
     name: str
     seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotation:
+    """A rotation of mixed-integer programs over layers (`repair.layerwise`)."""
+
+    layers: str
+    rows: int
+    box: float
+    seconds: float
+    before: float
+    """Merit of the network's own weights."""
+    after: float
+    steps: int
+    """Programs that were solved."""
+    accepted: int
+    """Those that lowered the merit."""
+    broken: int
+    """Rows that broke the constraint without need."""
+    left: int
+    """Those that do afterwards."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +148,7 @@ def network(run: Path | None, seed: int, scenes: int, folder: Path, progress: Up
     return model
 
 
-def bench_repair(model: Model, seconds: float) -> Iterator[Proof | Part | str]:
+def bench_repair(model: Model, seconds: float) -> Iterator[Proof | Part | Rotation | str]:
     """Everything, in the thesis's scenes. `seconds` limits each program of edge functions, a quarter of it others."""
     world = THESIS.world()
     perform = make_perform(model, world, scenes=SCENES, steps=STEPS, seed=SEED)
@@ -138,6 +162,7 @@ def bench_repair(model: Model, seconds: float) -> Iterator[Proof | Part | str]:
     yield from last_layer(study, seconds / 4)
     yield from thesis(study, seconds / 4)
     yield from edge_function(study, seconds)
+    yield from rotations(study, seconds / 10)
 
 
 def last_layer(
@@ -219,6 +244,34 @@ def thesis(
             incumbent=np.inf if found.incumbent is None else found.incumbent, bound=found.bound or 0.0,
             left=study.left(params, drawn, diamond),
         )  # fmt: skip
+
+
+def rotations(study: Study, seconds: float, *, rows: tuple[int, ...] = ROTATION_ROWS) -> Iterator[Rotation]:
+    """The thesis's rotation, for the barrier: over every layer, and over the readout alone, which may go as far.
+
+    `seconds` limits each program.
+    """
+    model, barrier = study.model, Barrier(kinematics=study.model.integrator)
+    for count in rows:
+        half = count // 2
+        drawn = concatenate([study.drawn(barrier, half, broken=True), study.drawn(barrier, count - half)])
+        problem = Problem(
+            scales=model.scales, situations=drawn, targets=study.acts(drawn), constraint=barrier, bodies=study.bodies,
+            limit=model.integrator.max_acceleration,
+        )  # fmt: skip
+        own = jax.device_get(model.params)
+        for name, layers in (("readout alone", ["readout/layer0"]), ("all layers", None)):
+            begun = time.perf_counter()
+            found = layerwise(
+                own, problem, radius=ROTATION_BOX, price=PRICE, layers=layers, rounds=TURNS,
+                limits=Limits(seconds=seconds, gap=GAP),
+            )  # fmt: skip
+            yield Rotation(
+                layers=name, rows=len(drawn), box=ROTATION_BOX, seconds=time.perf_counter() - begun,
+                before=found.history[0].before, after=found.merit, steps=len(found.history),
+                accepted=sum(step.accepted for step in found.history), broken=study.left(own, drawn, barrier),
+                left=study.left(found.params, drawn, barrier),
+            )  # fmt: skip
 
 
 def _size(size: dict[str, int]) -> tuple[int, int]:

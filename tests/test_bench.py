@@ -14,7 +14,18 @@ from gnn.decode import Integrator
 from repair.errors import Status
 from repair.network import Situations
 from repair.weight_box import Polished
-from swarmnet.bench_repair import GAP, Part, Proof, Study, edge_function, last_layer, loop_parts, thesis
+from swarmnet.bench_repair import (
+    GAP,
+    Part,
+    Proof,
+    Rotation,
+    Study,
+    edge_function,
+    last_layer,
+    loop_parts,
+    rotations,
+    thesis,
+)
 from swarmnet.bench_throughput import AGENTS, EPISODE, bench_throughput
 from swarmnet.cli import main
 from swarmnet.figures import svg
@@ -102,6 +113,18 @@ def test_boxes_that_took_too_long_are_not_tried_with_more_rows(study, monkeypatc
     assert "0.02 is left out from 4 rows on" in found[4]
 
 
+def test_the_rotation_over_layers_lowers_the_merit(study):
+    alone, every = rotations(study, 5.0, rows=(6,))
+    assert (alone.layers, every.layers) == ("readout alone", "all layers")
+    for found in (alone, every):
+        assert found.rows == 6
+        assert found.broken >= 3  # half are drawn from those that break it
+        assert found.after < found.before == alone.before  # its targets are its own actions: there is only price to pay
+        assert 1 <= found.accepted <= found.steps
+        assert found.left <= found.broken
+    assert every.steps > alone.steps
+
+
 def test_parts_of_a_round(study):
     parts = list(loop_parts(study, steps=250))
     assert [part.name for part in parts] == ["screening", "250 Adam steps", "quadratic program"]
@@ -114,7 +137,20 @@ def test_repair_is_printed_and_written(study, tmp_path, capsys, monkeypatch):
         binaries=7, size=(3, 4), incumbent=2.0, bound=1.984,
     )  # fmt: skip
     monkeypatch.setattr("swarmnet.commands.bench.network", lambda *_: study.model)
-    monkeypatch.setattr("swarmnet.commands.bench.bench_repair", lambda *_: [Part("roll-out", 5.0), "left out", proof])
+    turned = Rotation(
+        layers="all layers",
+        rows=20,
+        box=0.02,
+        seconds=9.0,
+        before=3.0,
+        after=2.5,
+        steps=10,
+        accepted=4,
+        broken=9,
+        left=2,
+    )
+    found = [Part("roll-out", 5.0), "left out", proof, turned]
+    monkeypatch.setattr("swarmnet.commands.bench.bench_repair", lambda *_: found)
     file = tmp_path / "bench-repair.json"
     assert main(["bench", "repair", "--json", str(file)]) == 0
     printed = capsys.readouterr().out.splitlines()
@@ -123,4 +159,6 @@ def test_repair_is_printed_and_written(study, tmp_path, capsys, monkeypatch):
     cells = {(row["row"], row["column"]): row for row in json.loads(file.read_text())["rows"]}
     assert cells["edge function", "R=20 box=0.02 seconds"]["status"] == "optimal"
     assert cells["edge function", "R=20 box=0.02 binaries"]["value"] == 7
+    assert cells["rotation, all layers", "R=20 box=0.02 merit"]["value"] == 2.5
+    assert "repair.rotation.all_layers.r20.box0.02.rows_left_violated 2" in printed
     assert (tmp_path / "bench-repair.svg").read_text().startswith("<?xml")

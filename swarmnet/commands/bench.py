@@ -19,7 +19,7 @@ from swarm_mjcf.build import compile_scene
 from swarm_mjcf.spec import SceneSpec
 from swarmnet.bench_engines import bench_engines
 from swarmnet.bench_experts import bench_experts
-from swarmnet.bench_repair import Part, Proof, bench_repair, network
+from swarmnet.bench_repair import Part, Proof, Rotation, bench_repair, network
 from swarmnet.bench_rl import PUBLISHED_RATE, bench_rl
 from swarmnet.bench_throughput import bench_throughput
 from swarmnet.bench_train import bench_loop, bench_one_core
@@ -210,6 +210,8 @@ def _repair(config: Bench) -> Results:
         elif isinstance(found, Part):
             print(f"repair.loop.{_metric(found.name)}.seconds {found.seconds:.4g}", flush=True)
             rows.append(Row("parts of the loop, 512 scenes", f"{found.name} seconds", found.seconds, unit="s"))
+        elif isinstance(found, Rotation):
+            rows += _rotation(found)
         else:
             proofs.append(found)
             rows += _proof(found)
@@ -235,6 +237,21 @@ def _proof(found: Proof) -> Iterator[Row]:
         if value is not None:
             print(f"{where}.{_metric(figure.replace('[%]', 'percent'))} {value:.5g}", flush=True)
             yield Row(found.family, f"{column} {figure}", value, unit=unit, more={"status": found.status})
+
+
+def _rotation(found: Rotation) -> Iterator[Row]:
+    where = f"repair.rotation.{_metric(found.layers)}.r{found.rows}.box{found.box:g}"
+    for figure, value, unit in (
+        ("seconds", found.seconds, "s"),
+        ("merit before", found.before, ""),
+        ("merit", found.after, ""),
+        ("programs", found.steps, "1"),
+        ("programs accepted", found.accepted, "1"),
+        ("rows violated before", found.broken, "1"),
+        ("rows left violated", found.left, "1"),
+    ):
+        print(f"{where}.{_metric(figure)} {value:.5g}", flush=True)
+        yield Row(f"rotation, {found.layers}", f"R={found.rows} box={found.box:g} {figure}", value, unit=unit)
 
 
 def _build(config: Bench) -> Results:
