@@ -2,6 +2,7 @@
 
 from itertools import combinations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -156,8 +157,15 @@ def shielded(
     e = encounters(situations, bodies)
     if not e.present.shape[1] or np.isinf(kinematics.max_acceleration):
         return safe
-    xp = action.__array_namespace__()
-    return xp.where(possible[:, None], safe, evasive(constraint, e, safe, kinematics))
+
+    def turned(safe: Array) -> Array:
+        xp = safe.__array_namespace__()
+        return xp.where(possible[:, None], safe, evasive(constraint, e, safe, kinematics))
+
+    # Rarely needed, and several times what comes before it.
+    if isinstance(safe, np.ndarray):
+        return safe if possible.all() else turned(safe)
+    return jax.lax.cond(jnp.all(possible), lambda safe: safe, turned, safe)
 
 
 def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:

@@ -22,6 +22,11 @@ from envs.storage import save
 from gnn.checkpoint import Checkpoints, describe, load_model
 from gnn.config import PRESETS, TrainConfig
 from gnn.decode import Integrator
+from repair.config import LoopConfig
+from repair.errors import Status
+from repair.loop import Repaired
+from repair.network import Situations
+from repair.verify import Verification
 from swarm_mjcf.errors import SwarmError
 from swarmnet.cli import main, parse
 from swarmnet.commands.certify import unpacked
@@ -129,6 +134,7 @@ def test_from_one_end_to_the_other(given: Path, tmp_path: Path, capsys):
     assert document["settings"]["rounds"] == 1
     assert [row["round"] for row in document["rounds"]][:2] == [0, 1]
     assert document["fresh"]["scenes"] == 8
+    assert document["fresh"]["lost"] == 0
     assert document["verification"]["holds_as_executed"] == (document["verification"]["avoidable"] == 0)
     report = re.sub(r"<[^>]*>", "", (run / "report.html").read_text())
     for words in ("What is guaranteed", "64-bit arithmetic", "What is evidence", "What is not claimed"):
@@ -143,6 +149,18 @@ def test_from_one_end_to_the_other(given: Path, tmp_path: Path, capsys):
     assert judged["scenes"] == 4
     assert len(judged["collisions"]) == 2
     assert {path.name for path in (run / "figures").glob("repair_*")} == {"repair_pareto.svg", "repair_rounds.svg"}
+
+
+def test_scenes_that_were_lost_at_the_start_are_named():
+    v = Verification(
+        rows=9, violated=0, avoidable=0, violated_before_clip=0, introduced=0, mended=0, worst=1.0, deviation=0.1
+    )
+    nobody = Situations(own=np.zeros((0, 4)), senders={}, present={})
+    found = Repaired({}, Status.FEASIBLE, 0, v, nobody, 1.0, history=[{"contact_steps": 0.1}])
+    fresh = {"scenes": 1000, "trajectories": 0.003, "contact_steps": 0.001}
+    some, none = (command.words(found, LoopConfig(), fresh | {"lost": lost}) for lost in (2, 0))
+    assert "3 scenes with a contact (2 of them lost at the start, whatever anybody does), so with 95%" in some
+    assert "3 scenes with a contact, so with 95%" in none
 
 
 def test_what_is_done_is_not_done_again(given: Path, repaired: Path, monkeypatch, capsys):

@@ -15,6 +15,7 @@ from gnn.train import fingerprint
 from repair.config import LoopConfig
 from repair.linearise import FreeWeights
 from repair.loop import Repaired, contacts, repair
+from repair.lost import lost
 from repair.network import Situations, check_encodable, concatenate, fitted
 from repair.verify import clopper_pearson
 from swarm_mjcf.errors import SpecError, SwarmError
@@ -70,7 +71,8 @@ def run(config: Repair) -> int:
                 _release(config.run)
                 raise
         # The best round was chosen by its scenes; what it is worth is for others to say.
-        fresh = contacts(perform(found.params, how.rounds + 2))
+        acted = perform(found.params, how.rounds + 2)
+        fresh = contacts(acted) | {"lost": int(lost(acted, world.scene, world.scene).sum())}
         keep(config.run, model, how, found, fresh)
         print(words(found, how, fresh))
     if not config.test_scenes:
@@ -132,7 +134,8 @@ def keep(folder: Path, model: Model, how: LoopConfig, found: Repaired, fresh: di
 
 
 def words(found: Repaired, how: LoopConfig, fresh: dict) -> str:
-    """What was done and what holds, in plain words. `fresh`: contacts in scenes that no round had."""
+    """What was done and what holds, in plain words. `fresh`: contacts in scenes that no round had, and how many of
+    them were lost at the start."""
     once = how.method in ("thesis", "last-layer")
     what = f"can keep the {how.constraint.name}" if once else f"broke the {how.constraint.name} without need"
     v, before = found.verification, found.history[0]["contact_steps"]
@@ -143,8 +146,9 @@ def words(found: Repaired, how: LoopConfig, fresh: dict) -> str:
         f"  {v.rows} training decisions that {what}: "
         f"{v.avoidable} break it as executed, {v.violated_before_clip} before the limits clip them",
         f"  in {fresh['scenes']} scenes that no round had: contact steps {100 * fresh['contact_steps']:.3g}% (before, "
-        f"in others: {100 * before:.3g}%); {touched} scenes with a contact, so with 95% confidence at most "
-        f"{100 * most:.2g}% of such scenes have one",
+        f"in others: {100 * before:.3g}%); {touched} scenes with a contact"
+        + (f" ({fresh['lost']} of them lost at the start, whatever anybody does)" if fresh["lost"] else "")
+        + f", so with 95% confidence at most {100 * most:.2g}% of such scenes have one",
         "  this is evidence about scenes like these, no proof for others: `swarmnet certify` proves a region",
     ]
     return "\n".join(lines)
