@@ -158,14 +158,18 @@ def shielded(
     if not e.present.shape[1] or np.isinf(kinematics.max_acceleration):
         return safe
 
-    def turned(safe: Array) -> Array:
-        xp = safe.__array_namespace__()
-        return xp.where(possible[:, None], safe, evasive(constraint, e, safe, kinematics))
-
     # Rarely needed, and several times what comes before it.
     if isinstance(safe, np.ndarray):
-        return safe if possible.all() else turned(safe)
-    return jax.lax.cond(jnp.all(possible), lambda safe: safe, turned, safe)
+        late = np.flatnonzero(~possible)
+        safe = safe.copy()
+        safe[late] = evasive(constraint, jax.tree.map(lambda x: x[late], e), safe[late], kinematics)
+        return safe
+    return jax.lax.cond(
+        jnp.all(possible),
+        lambda safe: safe,
+        lambda safe: jnp.where(possible[:, None], safe, evasive(constraint, e, safe, kinematics)),
+        safe,
+    )
 
 
 def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:
