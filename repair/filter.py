@@ -1,5 +1,6 @@
 """A run-time shield: the action nearest to the policy's that the constraint allows. Usable around any policy."""
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import jax
@@ -20,8 +21,10 @@ TIGHTEST = 8
 """Conditions of an agent whose lines are tried, those with the least slack; all of them are checked."""
 MORE = 3
 """Times that the lines are chosen anew where there are more conditions."""
-DIRECTIONS, LOOK, FINE = 36, 4, 6
-"""Where no action is allowed: directions that are tried, for how many control steps, and looks at each of them."""
+DIRECTIONS, LOOKS = 36, 24
+"""Where no action is allowed: directions that are tried, and how often the way along each of them is looked at."""
+SIDE = 1e-3
+"""By how much one side is preferred to the other [m]."""
 TOLERANCE = 1e-4
 """By how much an action may violate a condition and still count as allowed [m/s^2]."""
 
@@ -124,12 +127,15 @@ def evasive(
     """The action that, held on to, keeps the nearest body farthest away [m/s^2]: for who has no allowed one.
 
     Braking along the line of centres may come too late where a turn does not. Tried are `action` and the full
-    acceleration in `DIRECTIONS` directions for `LOOK` control steps; the other agent of a pair is taken to do the
-    opposite, as it finds the same by the same rule. Of many bodies the `TIGHTEST` of least slack count.
+    acceleration in `DIRECTIONS` directions, for a little longer than a stop takes; the other agent of a pair is taken
+    to do the opposite, as it finds the same by the same rule. Of many bodies the `TIGHTEST` of least slack count.
+    Where nothing keeps clear, bodies meet off centre and faster than brakes alone would have let them.
     """
     xp = action.__array_namespace__()
     bodies = min(TIGHTEST, e.present.shape[1])
-    order = xp.argsort(xp.where(e.present, constraint.slack(e, action), np.inf), axis=1)[:, :bodies]
+    slack = constraint.slack(e, action)  # a body may have several conditions
+    slack = xp.min(slack.reshape(*e.present.shape, -1), axis=-1)
+    order = xp.argsort(xp.where(e.present, slack, np.inf), axis=1)[:, :bodies]
     position, velocity = (xp.take_along_axis(x, order[..., None], axis=1) for x in (e.relative, e.velocity))
     reach, here, steers = (xp.take_along_axis(x, order, axis=1) for x in (e.reach, e.present, e.steers))
     angle = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
@@ -138,38 +144,51 @@ def evasive(
     tried = xp.concatenate([action[:, None], rim], axis=1)
     push = xp.where(steers, 2.0, 1.0)[:, None, :, None] * tried[:, :, None]  # of the agent seen from the body
     nearest = xp.full(tried.shape[:2], np.inf, dtype=action.dtype)
-    for time in kinematics.dt * np.arange(1, LOOK * FINE + 1) / FINE:
+    for time in looks(kinematics):
         away = length((position + velocity * time)[:, None] + push * (time * time / 2)) - reach[:, None]
         nearest = xp.minimum(nearest, xp.min(xp.where(here[:, None], away, np.inf), axis=-1))
-    best = xp.argmax(nearest, axis=1)
+    # Head-on, left is as good as right: both of a pair take the same side.
+    to = position[:, :1]
+    side = to[..., 0] * tried[..., 1] - to[..., 1] * tried[..., 0]
+    best = xp.argmax(nearest + SIDE * side / (1e-9 + length(to) * length(tried)), axis=1)
     return xp.take_along_axis(tried, best[:, None, None], axis=1)[:, 0]
 
 
+def looks(kinematics: Kinematics) -> Float[np.ndarray, " t"]:
+    """When `evasive` looks [s]: `LOOKS` times in 1.2 of what a stop from the largest speed takes; where there is no
+    largest speed, in 4 control steps."""
+    stop = kinematics.max_speed / kinematics.max_acceleration
+    return (1.2 * stop if np.isfinite(stop) else 4 * kinematics.dt) * np.arange(1, LOOKS + 1) / LOOKS
+
+
 def shielded(
-    constraint: Constraint,
+    constraints: Sequence[Constraint],
     situations: Situations,
     action: Float[Array, "R 2"],
     bodies: Bodies,
     kinematics: Kinematics,
 ) -> Float[Array, "R 2"]:
-    """What the filter makes of executed actions [m/s^2]: the nearest allowed one, `evasive` where there is none."""
-    safe, possible = safe_actions(constraint, situations, action, bodies, kinematics)
-    e = encounters(situations, bodies)
-    if not e.present.shape[1] or np.isinf(kinematics.max_acceleration):
+    """What the filter makes of executed actions [m/s^2]: the nearest that the first of the constraints allows; of the
+    next, where that allows none; `evasive`, where none does."""
+    safe, possible = safe_actions(constraints[0], situations, action, bodies, kinematics)
+    if np.isinf(kinematics.max_acceleration) or not encounters(situations, bodies).present.shape[1]:
         return safe
+
+    def late(safe: Array, possible: Array, situations: Situations, action: Array) -> Array:
+        xp = safe.__array_namespace__()
+        for constraint in constraints[1:]:
+            other, fits = safe_actions(constraint, situations, action, bodies, kinematics)
+            safe, possible = xp.where((fits & ~possible)[:, None], other, safe), possible | fits
+        turned = evasive(constraints[-1], encounters(situations, bodies), safe, kinematics)
+        return xp.where(possible[:, None], safe, turned)
 
     # Rarely needed, and several times what comes before it.
     if isinstance(safe, np.ndarray):
-        late = np.flatnonzero(~possible)
+        rows = np.flatnonzero(~possible)
         safe = safe.copy()
-        safe[late] = evasive(constraint, jax.tree.map(lambda x: x[late], e), safe[late], kinematics)
+        safe[rows] = late(safe[rows], possible[rows], situations.take(rows), action[rows])
         return safe
-    return jax.lax.cond(
-        jnp.all(possible),
-        lambda safe: safe,
-        lambda safe: jnp.where(possible[:, None], safe, evasive(constraint, e, safe, kinematics)),
-        safe,
-    )
+    return jax.lax.cond(jnp.all(possible), lambda safe, *_: safe, late, safe, possible, situations, action)
 
 
 def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:
@@ -177,9 +196,18 @@ def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:
 
 
 def make_filtered(
-    policy: Policy, constraint: Constraint, bodies: Bodies, kinematics: Kinematics, *, goal: bool = True
+    policy: Policy,
+    constraint: Constraint | Sequence[Constraint],
+    bodies: Bodies,
+    kinematics: Kinematics,
+    *,
+    goal: bool = True,
 ) -> Policy:
-    """`policy` behind the constraint: a policy of the same kind. Absent agents keep the action they were given."""
+    """`policy` behind the constraint: a policy of the same kind. Absent agents keep the action they were given.
+
+    Of several constraints, the strictest first, each counts where those before it allow nothing.
+    """
+    constraints = tuple(constraint) if isinstance(constraint, Sequence) else (constraint,)
 
     def filtered(state: State, params: object, key: object = None) -> Float[Array, "S N 2"]:
         wanted = policy(state, params, key)
@@ -199,7 +227,7 @@ def make_filtered(
             },
         )
         flat = limited(situations.own[:, 2:], jnp.asarray(wanted).reshape(-1, 2), kinematics)
-        safe = shielded(constraint, situations, flat, bodies, kinematics)
+        safe = shielded(constraints, situations, flat, bodies, kinematics)
         safe = jnp.asarray(safe).reshape(wanted.shape)
         return jnp.where(jnp.asarray(state.agent_present)[..., None], safe, wanted)
 

@@ -118,11 +118,13 @@ class Study:
         """The network's actions [m/s^2]."""
         return np.asarray(actions(self.model.params, self.model.scales, situations))
 
-    def drawn(self, constraint: Constraint, count: int, *, broken: bool = False) -> Situations:
+    def drawn(self, constraint: Constraint, count: int, *, broken: bool | None = None) -> Situations:
         """Decisions in an order that is the same for every count, without those that break the constraint and could
-        not but do so; `broken`: only those that break it without need."""
+        not but do so; `broken`: only those that break it without need, or that keep it."""
         found = screen(constraint, self.situations, self.acts(self.situations), self.bodies, self.model.integrator)
-        wanted = found.avoidable if broken else ~found.violated | found.avoidable
+        wanted = found.avoidable if broken else ~found.violated
+        if broken is None:
+            wanted |= found.avoidable
         order = np.random.default_rng(0).permutation(len(wanted))
         return self.situations.take(order[wanted[order]][:count])
 
@@ -149,7 +151,8 @@ def network(run: Path | None, seed: int, scenes: int, folder: Path, progress: Up
 
 
 def bench_repair(model: Model, seconds: float) -> Iterator[Proof | Part | Rotation | str]:
-    """Everything, in the thesis's scenes. `seconds` limits each program of edge functions, a quarter of it others."""
+    """Everything, in the thesis's scenes. `seconds` limits each program of edge functions, a quarter of it those of the
+    last layer, a tenth each of those that rotate."""
     world = THESIS.world()
     perform = make_perform(model, world, scenes=SCENES, steps=STEPS, seed=SEED)
     acted = perform(model.params, 0)
@@ -254,7 +257,7 @@ def rotations(study: Study, seconds: float, *, rows: tuple[int, ...] = ROTATION_
     model, barrier = study.model, Barrier(kinematics=study.model.integrator)
     for count in rows:
         half = count // 2
-        drawn = concatenate([study.drawn(barrier, half, broken=True), study.drawn(barrier, count - half)])
+        drawn = concatenate([study.drawn(barrier, half, broken=True), study.drawn(barrier, count - half, broken=False)])
         problem = Problem(
             scales=model.scales, situations=drawn, targets=study.acts(drawn), constraint=barrier, bodies=study.bodies,
             limit=model.integrator.max_acceleration,

@@ -265,7 +265,8 @@ class Bench:
     run: Path | None = None
     """repair: run folder of the network; by default one of preset thesis-ch5-small is trained, in minutes."""
     seconds: float = 120.0
-    """repair: limit for a proof of edge functions; a quarter of it for those of the last layer [s]."""
+    """repair: limit for a proof of edge functions; a quarter of it for those of the last layer, a tenth for each
+    program of the rotation over layers [s]."""
     json: Path | None = None
     """Also write the results here, machine-readable."""
 

@@ -219,9 +219,9 @@ class Evaluate:
     """The same with others and obstacles closer than this alone [m]; with --nearest, both hold."""
     filter: Literal["barrier", "disc", "polygon", "diamond", "roll-out"] | None = None
     """Put a run-time filter around the policy: what the constraint does not allow becomes the nearest action that it
-    does (`swarmnet repair --help` names the constraints)."""
+    does, and where there is none, agents turn (`swarmnet repair --help` names the constraints)."""
     filter_margin: float = 0.0
-    """Of the filter: kept between surfaces beyond touching [m]."""
+    """Of the filter: kept between surfaces beyond touching [m], where that is possible."""
     filter_share: float = 0.7
     """Of the filter barrier: part of the largest acceleration counted on for braking."""
     perception_noise: float | None = None

@@ -20,11 +20,12 @@ from repair.constraints.registry import make_constraint
 from repair.encounters import Encounters, encounters
 from repair.filter import (
     DIRECTIONS,
-    FINE,
-    LOOK,
+    LOOKS,
+    SIDE,
     TIGHTEST,
     TOLERANCE,
     evasive,
+    looks,
     make_filtered,
     nearest_allowed,
     safe_actions,
@@ -236,26 +237,82 @@ def crossing(rows: int, seed: int) -> State:
 
 
 def clearance(e: Encounters, row: int, action: np.ndarray) -> float:
-    """How near any body comes in `LOOK` control steps of one action, the other agent of a pair doing the opposite."""
+    """How near any body comes by one action, the other agent of a pair doing the opposite."""
     worst = np.inf
-    for body in range(e.present.shape[1]):
+    for body in np.flatnonzero(e.present[row]):
         push = action * (2 if e.steers[row, body] else 1)
-        for time in SPEC.dt * np.arange(1, LOOK * FINE + 1) / FINE:
+        for time in looks(SPEC):
             at = e.relative[row, body] + e.velocity[row, body] * time + push * time**2 / 2
             worst = min(worst, np.hypot(*at) - e.reach[row, body])
     return worst
 
 
-def test_who_cannot_brake_in_time_turns_where_it_stays_farthest_away():
-    e = encounters(situations_of_state(crossing(30, 0)), SPEC)
+def crowd(rows: int, seed: int) -> State:
+    """Twelve agents at random, a few of them absent, and two obstacles, one of them absent, on the spot."""
+    rng = np.random.default_rng(seed)
+    return scene_state(
+        replace(SPEC, num_agents=12, num_obstacles=2),
+        rng.uniform(-12, 12, (rows, 12, 2)),
+        rng.normal(0, 6, (rows, 12, 2)),
+        obstacle=np.stack([np.full((rows, 2), [25.0, 0.0]), np.zeros((rows, 2))], axis=1),
+        obstacle_present=np.array([True, False]) & np.ones((rows, 2), bool),
+        agent_present=rng.random((rows, 12)) < 0.4,
+    )
+
+
+def test_it_looks_as_far_as_a_stop_takes():
+    np.testing.assert_allclose(looks(SPEC)[[0, -1]], [1.2 / LOOKS, 1.2])  # 10 m/s at 10 m/s^2
+    unlimited = replace(SPEC, max_speed=np.inf, contacts=False)
+    np.testing.assert_allclose(looks(unlimited)[-1], 4 * SPEC.dt)
+
+
+@pytest.mark.parametrize("state", [crossing(30, 0), crowd(6, 3)], ids=["crossing", "crowd"])
+def test_who_cannot_brake_in_time_turns_where_it_stays_farthest_away(state):
+    """Of the present alone; of no more than 8 bodies in these scenes."""
+    s = situations_of_state(state)
+    s = s.take(np.asarray(state.agent_present).ravel())
+    e = encounters(s, SPEC)
+    assert e.present.sum(axis=1).max() <= TIGHTEST
     rng = np.random.default_rng(1)
-    given = rng.normal(0, 3, (60, 2))
+    given = rng.normal(0, 3, (len(s), 2))
     found = evasive(Barrier(kinematics=SPEC), e, given, SPEC)
     angle = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
     rim = SPEC.max_acceleration * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    for row in range(60):
+    for row in range(len(s)):
         values = [clearance(e, row, tried) for tried in (given[row], *rim)]
-        assert clearance(e, row, found[row]) == pytest.approx(max(values), abs=1e-9)
+        assert clearance(e, row, found[row]) == pytest.approx(max(values), abs=2 * SIDE)
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, 0.3])
+def test_head_on_both_turn_to_the_same_side(angle: float):
+    """Ties of left and right are broken so that neither turns into the other's way."""
+    along = np.array([np.cos(angle), np.sin(angle)])
+    state = scene_state(
+        replace(SPEC, num_agents=2, num_obstacles=0),
+        np.stack([-2.75 * along, 2.75 * along])[None],
+        np.stack([9.5 * along, -9.5 * along])[None],
+    )
+    found = shielded([Barrier(kinematics=SPEC)], situations_of_state(state), np.zeros((2, 2)), SPEC, SPEC)
+    np.testing.assert_allclose(found[0], -found[1], atol=1e-6)
+    assert abs(along[0] * found[0, 1] - along[1] * found[0, 0]) > 9
+
+
+def test_what_must_hold_counts_where_the_stricter_cannot_be_kept():
+    s = situations_of_state(crossing(300, 4))
+    rng = np.random.default_rng(2)
+    wanted = rng.normal(0, 5, (600, 2))
+    strict, bare = Barrier(kinematics=SPEC, margin=0.4, share=0.6), Barrier(kinematics=SPEC)
+    found = shielded([strict, bare], s, wanted, SPEC, SPEC)
+    first, kept = safe_actions(strict, s, wanted, SPEC, SPEC)
+    second, held = safe_actions(bare, s, wanted, SPEC, SPEC)
+    between = held & ~kept
+    assert min(kept.sum(), between.sum(), (~held & ~kept).sum()) > 20
+    np.testing.assert_array_equal(found[kept], first[kept])
+    np.testing.assert_array_equal(found[between], second[between])
+    # The same in JAX, where all rows go one way or the other together.
+    cast = jax.tree.map(lambda x: jnp.asarray(x, None if x.dtype == bool else jnp.float32), s)
+    theirs = jax.jit(lambda s, u: shielded([strict, bare], s, u, SPEC, SPEC))(cast, jnp.asarray(wanted, jnp.float32))
+    assert (np.abs(np.asarray(theirs) - found).max(axis=1) < 0.05).mean() > 0.98
 
 
 def test_only_who_has_no_allowed_action_is_turned_and_both_of_a_pair_alike():
@@ -264,7 +321,7 @@ def test_only_who_has_no_allowed_action_is_turned_and_both_of_a_pair_alike():
     s, barrier = situations_of_state(state), Barrier(kinematics=SPEC)
     wanted = np.zeros((80, 2))
     safe, possible = safe_actions(barrier, s, wanted, SPEC, SPEC)
-    found = shielded(barrier, s, wanted, SPEC, SPEC)
+    found = shielded([barrier], s, wanted, SPEC, SPEC)
     assert 10 < possible.sum() < 70
     np.testing.assert_array_equal(found[possible], safe[possible])
     turned = found[~possible].reshape(-1, 2, 2)  # both of a pair meet the same
@@ -286,6 +343,18 @@ def test_a_turn_saves_in_physics_whom_brakes_do_not(monkeypatch):
         policy = make_filtered(lambda state, *_: jnp.zeros((1, 2, 2)), barrier, spec, spec)
         recording = jax.device_get(make_rollout(env, policy, steps=8)(None, start, scene_keys(0, np.arange(1))))
         assert bool(recording.contacts.agent_states.any()) == touching
+
+
+@pytest.mark.parametrize("name", ["barrier", "disc", "polygon", "diamond", "roll-out"])
+def test_any_constraint_makes_a_filter(name: str):
+    """Whose actions stay within the limit, and which does to the same rows what it does outside JAX."""
+    state = crossing(20, 5)
+    constraint = make_constraint(ConstraintConfig(name=name), SPEC)
+    found = jax.jit(make_filtered(lambda *_: jnp.zeros((20, 2, 2)), constraint, SPEC, SPEC))(state, None)
+    assert np.linalg.norm(found, axis=-1).max() <= SPEC.max_acceleration * (1 + 1e-5)
+    s = situations_of_state(state)
+    ours = shielded([constraint], s, np.zeros((40, 2)), SPEC, SPEC)
+    assert (np.abs(np.asarray(found).reshape(-1, 2) - ours).max(axis=1) < 0.05).mean() > 0.9
 
 
 def test_absent_agents_keep_their_action():

@@ -72,7 +72,8 @@ def run(config: Repair) -> int:
                 raise
         # The best round was chosen by its scenes; what it is worth is for others to say.
         acted = perform(found.params, how.rounds + 2)
-        fresh = contacts(acted) | {"lost": int(lost(acted, world.scene, world.scene).sum())}
+        touched = (np.asarray(acted.touching_agent) | np.asarray(acted.touching_obstacle)).any(axis=(1, 2))
+        fresh = contacts(acted) | {"lost": int((touched & lost(acted, world.scene, world.scene)).sum())}
         keep(config.run, model, how, found, fresh)
         print(words(found, how, fresh))
     if not config.test_scenes:
