@@ -1,6 +1,5 @@
 """A run-time shield: the action nearest to the policy's that the constraint allows. Usable around any policy."""
 
-from collections.abc import Sequence
 from itertools import combinations
 
 import jax
@@ -162,33 +161,29 @@ def looks(kinematics: Kinematics) -> Float[np.ndarray, " t"]:
 
 
 def shielded(
-    constraints: Sequence[Constraint],
+    constraint: Constraint,
     situations: Situations,
     action: Float[Array, "R 2"],
     bodies: Bodies,
     kinematics: Kinematics,
 ) -> Float[Array, "R 2"]:
-    """What the filter makes of executed actions [m/s^2]: the nearest that the first of the constraints allows; of the
-    next, where that allows none; `evasive`, where none does."""
-    safe, possible = safe_actions(constraints[0], situations, action, bodies, kinematics)
-    if np.isinf(kinematics.max_acceleration) or not encounters(situations, bodies).present.shape[1]:
+    """What the filter makes of executed actions [m/s^2]: the nearest allowed one, `evasive` where there is none."""
+    safe, possible = safe_actions(constraint, situations, action, bodies, kinematics)
+    e = encounters(situations, bodies)
+    if np.isinf(kinematics.max_acceleration) or not e.present.shape[1]:
         return safe
-
-    def late(safe: Array, possible: Array, situations: Situations, action: Array) -> Array:
-        xp = safe.__array_namespace__()
-        for constraint in constraints[1:]:
-            other, fits = safe_actions(constraint, situations, action, bodies, kinematics)
-            safe, possible = xp.where((fits & ~possible)[:, None], other, safe), possible | fits
-        turned = evasive(constraints[-1], encounters(situations, bodies), safe, kinematics)
-        return xp.where(possible[:, None], safe, turned)
-
     # Rarely needed, and several times what comes before it.
     if isinstance(safe, np.ndarray):
-        rows = np.flatnonzero(~possible)
+        late = np.flatnonzero(~possible)
         safe = safe.copy()
-        safe[rows] = late(safe[rows], possible[rows], situations.take(rows), action[rows])
+        safe[late] = evasive(constraint, jax.tree.map(lambda x: x[late], e), safe[late], kinematics)
         return safe
-    return jax.lax.cond(jnp.all(possible), lambda safe, *_: safe, late, safe, possible, situations, action)
+    return jax.lax.cond(
+        jnp.all(possible),
+        lambda safe: safe,
+        lambda safe: jnp.where(possible[:, None], safe, evasive(constraint, e, safe, kinematics)),
+        safe,
+    )
 
 
 def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:
@@ -196,18 +191,9 @@ def _others(present: Bool[Array, "S N"]) -> Bool[Array, "S N N"]:
 
 
 def make_filtered(
-    policy: Policy,
-    constraint: Constraint | Sequence[Constraint],
-    bodies: Bodies,
-    kinematics: Kinematics,
-    *,
-    goal: bool = True,
+    policy: Policy, constraint: Constraint, bodies: Bodies, kinematics: Kinematics, *, goal: bool = True
 ) -> Policy:
-    """`policy` behind the constraint: a policy of the same kind. Absent agents keep the action they were given.
-
-    Of several constraints, the strictest first, each counts where those before it allow nothing.
-    """
-    constraints = tuple(constraint) if isinstance(constraint, Sequence) else (constraint,)
+    """`policy` behind the constraint: a policy of the same kind. Absent agents keep the action they were given."""
 
     def filtered(state: State, params: object, key: object = None) -> Float[Array, "S N 2"]:
         wanted = policy(state, params, key)
@@ -227,7 +213,7 @@ def make_filtered(
             },
         )
         flat = limited(situations.own[:, 2:], jnp.asarray(wanted).reshape(-1, 2), kinematics)
-        safe = shielded(constraints, situations, flat, bodies, kinematics)
+        safe = shielded(constraint, situations, flat, bodies, kinematics)
         safe = jnp.asarray(safe).reshape(wanted.shape)
         return jnp.where(jnp.asarray(state.agent_present)[..., None], safe, wanted)
 

@@ -221,7 +221,7 @@ class Evaluate:
     """Put a run-time filter around the policy: what the constraint does not allow becomes the nearest action that it
     does, and where there is none, agents turn (`swarmnet repair --help` names the constraints)."""
     filter_margin: float = 0.0
-    """Of the filter: kept between surfaces beyond touching [m], where that is possible."""
+    """Of the filter: kept between surfaces beyond touching [m]."""
     filter_share: float = 0.7
     """Of the filter barrier: part of the largest acceleration counted on for braking."""
     perception_noise: float | None = None

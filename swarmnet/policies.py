@@ -58,8 +58,7 @@ class Source:
     radius: float | None = None
     """The same for others and obstacles closer than this [m]."""
     shield: ConstraintConfig | None = None
-    """A run-time filter lets through what this constraint allows, else the nearest action that it does; without its
-    margin, where nothing keeps that."""
+    """A run-time filter lets through what this constraint allows, else the nearest action that it does."""
 
     @property
     def decentralised(self) -> bool:
@@ -80,9 +79,8 @@ class Source:
         """The policy for a world, and its parameters. Raises SwarmError for what cannot act."""
         policy, params = self._bare(world)
         if self.shield is not None:
-            kept = [self.shield, replace(self.shield, margin=0.0)][: 1 + (self.shield.margin > 0)]
-            constraints = [make_constraint(config, world.scene) for config in kept]
-            policy = make_filtered(policy, constraints, world.scene, world.scene, goal=world.scene.goal)
+            constraint = make_constraint(self.shield, world.scene)
+            policy = make_filtered(policy, constraint, world.scene, world.scene, goal=world.scene.goal)
         return policy, params
 
     def _bare(self, world: World) -> tuple[Policy, object]:

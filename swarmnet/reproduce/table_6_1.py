@@ -65,9 +65,9 @@ TESTED = 1000
 MUST = ConstraintConfig()
 """What ours has to keep: the braking barrier, of obstacles and of agents."""
 LOOPED = LoopConfig()
-RESERVE = replace(MUST, margin=MUST.margin + LOOPED.reserve_margin, share=MUST.share * LOOPED.reserve_share)
-SHIELDS = (RESERVE, MUST)
-"""What the run-time filter keeps: what the loop learns, and where that allows nothing, what must hold."""
+SHIELD = replace(MUST, margin=MUST.margin + LOOPED.reserve_margin, share=MUST.share * LOOPED.reserve_share)
+"""What the run-time filter keeps: with the same in reserve as what the loop learns. Where that allows nothing it turns
+at once: keeping what must hold as long as that is possible left 2 contacts in 10,000 trajectories instead of none."""
 EDGES, NODES = ("edge/obstacle/layer2/*", "edge/agent/layer2/*"), ("node/*", "readout/*")
 
 IMITATED, REPLICA, READOUT, EDGE, EDGE_NODE = (
@@ -200,8 +200,8 @@ class Policies:
         """What the row's policy does from the first states of a seed."""
         policy = make_policy(model.config, model.scales, goal=world.scene.goal)
         if row in (FILTER, BOTH):
-            constraints = [make_constraint(config, world.scene) for config in SHIELDS]
-            policy = make_filtered(policy, constraints, world.scene, world.scene, goal=world.scene.goal)
+            constraint = make_constraint(SHIELD, world.scene)
+            policy = make_filtered(policy, constraint, world.scene, world.scene, goal=world.scene.goal)
         if row == EXPERT:
             policy, _ = find_policy(EXPERT).policy(world)
         return make_perform(model, world, scenes=scenes, steps=STEPS, seed=seed, policy=policy)(model.params, 0)
@@ -315,7 +315,7 @@ def _inside(row: str, model: Model, original: Model, imitation: Acted, world: Wo
         action = actions(of.params, of.scales, rows)
         if row not in (FILTER, BOTH) or of is not model:
             return action
-        kept = [make_constraint(config, kinematics) for config in SHIELDS]
+        kept = make_constraint(SHIELD, kinematics)
         return shielded(kept, rows, executed(rows.own[:, 2:], action, kinematics), bodies, kinematics)
 
     action, before = decided(model), actions(original.params, original.scales, rows)
@@ -411,8 +411,8 @@ TABLE_6_1 = Experiment(
         "imitation policy comes to, stand beside. MSE: agents' positions, 10 predicted steps against the expert's. "
         "Violations and introduced ones are of the braking barrier by the executed action, in the same states. Rows: "
         "decisions that were constrained, and those that still break their method's own constraint without need. "
-        f"The filter keeps the barrier with a margin of {RESERVE.margin:g} m and {RESERVE.share:.3g} of the brakes, as "
-        f"the loop learns it, and where that is impossible the barrier that must hold. {MANY[0].upper()}{MANY[1:]}: "
+        f"The filter keeps the barrier with a margin of {SHIELD.margin:g} m and {SHIELD.share:.3g} of the brakes, as "
+        f"the loop learns it, and turns where that is impossible. {MANY[0].upper()}{MANY[1:]}: "
         f"{TIMES} times as many, of another seed; `lost` are those in which two bodies "
         "touch whatever anybody does from the first state on (`repair.lost`); `at most`: Clopper and Pearson, 95%. "
         f"Certificate: `swarmnet certify` for {CERTIFYING:g} s: the ring from the sum of radii to 15 m more, all sides "
