@@ -203,10 +203,8 @@ class _Model:
     def solve(self, trust: float) -> tuple[Float[Array, " P"], int]:
         """The change of the weights, and the number of rows that entered."""
         size = len(self.gradient)
-        factor = scipy.linalg.cho_factor(
-            self.gram + (self.stiffness + trust) * np.eye(size), lower=True, check_finite=False
-        )
-        free_change = -scipy.linalg.cho_solve(factor, self.gradient, check_finite=False)
+        factor = _factor(self.gram, self.stiffness + trust)
+        free_change = -scipy.linalg.cho_solve((factor, True), self.gradient, check_finite=False)
         change, chosen = free_change, np.zeros((0, 2), np.int64)
         towards = np.zeros((0, size))
         half = np.zeros((0, size))
@@ -225,13 +223,24 @@ class _Model:
             chosen, towards = np.concatenate([chosen, fresh]), np.concatenate([towards, rows])
             # A H^-1 A' = (L^-1 A')' (L^-1 A').
             half = np.concatenate(
-                [half, scipy.linalg.solve_triangular(factor[0], rows.T, lower=True, check_finite=False).T]
+                [half, scipy.linalg.solve_triangular(factor, rows.T, lower=True, check_finite=False).T]
             )
             needs = self.missing[chosen[:, 0], chosen[:, 1]] - towards @ free_change
             multipliers = _dual(half @ half.T, needs, self.price)
-            step = scipy.linalg.solve_triangular(factor[0].T, half.T @ multipliers, lower=False, check_finite=False)
+            step = scipy.linalg.solve_triangular(factor.T, half.T @ multipliers, lower=False, check_finite=False)
             change = free_change + step
         return change, len(chosen)
+
+
+def _factor(gram: Float[Array, "P P"], ridge: float) -> Float[np.ndarray, "P P"]:
+    """Cholesky's lower factor of `gram` + ridge, a larger one where the rounding of float32 products outweighs it."""
+    if not np.isfinite(gram).all():
+        raise RepairError("derivatives by the weights are not finite")
+    while True:
+        try:
+            return np.linalg.cholesky(gram + ridge * np.eye(len(gram)))
+        except np.linalg.LinAlgError:
+            ridge = max(8 * ridge, float(np.finfo(np.float32).eps * np.trace(gram)))
 
 
 ENTERING = 600

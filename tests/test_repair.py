@@ -29,7 +29,7 @@ from repair.limits import executed
 from repair.linearise import FreeWeights, Linearised
 from repair.loop import repair
 from repair.network import Situations, actions, fitted
-from repair.relax import Relaxation, SequentialProblem, relax
+from repair.relax import Relaxation, SequentialProblem, _factor, relax
 from repair.screen import Acted, decisions, least, screen
 from repair.verify import clopper_pearson, verify
 from swarm_mjcf.errors import SpecError, SwarmError
@@ -533,3 +533,17 @@ def test_what_could_have_been_avoided_does_not_depend_on_what_was_done():
         judged = screen(Barrier(kinematics=motion), state, np.array([action]), bodies, motion)
         assert judged.violated.all()
         assert judged.avoidable.all(), action
+
+
+def test_products_that_rounding_made_indefinite_are_factored_with_a_larger_ridge():
+    rng = np.random.default_rng(0)
+    flat = rng.normal(size=(20, 60)).astype(np.float32) * 30
+    gram = (flat.T @ flat).astype(np.float64)
+    assert np.linalg.eigvalsh(gram).min() < -1e-6
+    lower = _factor(gram, 1e-7)
+    whole = lower @ lower.T
+    np.testing.assert_allclose(whole, gram, atol=64 * np.finfo(np.float32).eps * np.trace(gram))
+    # As asked, where that is enough.
+    np.testing.assert_allclose(_factor(np.eye(3), 0.5), np.sqrt(1.5) * np.eye(3))
+    with pytest.raises(RepairError, match="not finite"):
+        _factor(np.full((2, 2), np.nan), 1.0)
