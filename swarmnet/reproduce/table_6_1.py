@@ -113,7 +113,7 @@ SHARES = (
     "seconds",
 )  # fmt: skip
 MANY, TIMES, MANY_SEED = "many trajectories", 10, 4_000_000
-"""Ten times as many of the thesis's scenes, of another seed. One choice was made by them: that the filter turns at once."""
+"""Ten times as many of the thesis's scenes, of another seed. One choice was made by them: the filter turns at once."""
 TOUCHED, LOST, AVOIDED, AT_MOST = (
     "with a contact", "lost at the start", "with a contact, not lost", "at most, not lost [%]",
 )  # fmt: skip
