@@ -78,10 +78,10 @@ def test_two_agents_can_add_twice_as_much():
 def test_whoever_is_lost_touches_whatever_it_does(seed: int, with_obstacle: bool):
     """Accelerations at random, fixed and straight away from each other; limits as in physics."""
     rng = np.random.default_rng(seed)
-    nodes = np.zeros((200, 4, 4))
-    angle = rng.uniform(0, 2 * np.pi, (200, 2))
-    nodes[:, 2:, :2] = rng.uniform(3.0, 7.0, (200, 2, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    nodes[:, 2:, 2:] = -nodes[:, 2:, :2] * rng.uniform(0, 4, (200, 2, 1)) + rng.normal(0, 3, (200, 2, 2))
+    nodes = np.zeros((1000, 4, 4))
+    angle = rng.uniform(0, 2 * np.pi, (1000, 2))
+    nodes[:, 2:, :2] = rng.uniform(3.0, 7.0, (1000, 2, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    nodes[:, 2:, 2:] = -nodes[:, 2:, :2] * rng.uniform(0, 4, (1000, 2, 1)) + rng.normal(0, 3, (1000, 2, 2))
     speed = np.linalg.norm(nodes[:, 2:, 2:], axis=-1, keepdims=True)
     nodes[:, 2:, 2:] *= np.minimum(1, MOTION.max_speed / np.maximum(speed, 1e-9))
     apart = np.linalg.norm(nodes[:, 2, :2] - nodes[:, 3, :2], axis=-1) > 2
@@ -89,7 +89,7 @@ def test_whoever_is_lost_touches_whatever_it_does(seed: int, with_obstacle: bool
     here = np.ones(nodes.shape[:2], bool)
     here[:, 1] = with_obstacle
     hopeless = lost(acted(nodes, here), BODIES, MOTION)
-    assert 5 < hopeless.sum() < len(nodes)
+    assert 0 < hopeless.sum() < len(nodes)
     for kind in ("random", "away", "fixed"):
         position, velocity = nodes[:, 2:, :2].copy(), nodes[:, 2:, 2:].copy()
         touched = np.zeros(len(nodes), bool)
