@@ -70,7 +70,7 @@ TABLE_4_1 = Experiment(
     leading=("swarmnet best",),
     notes=(
         f"N={CROWD}: the network of the row's other columns on a {CROWD_SHARE}th of the unseen scenes. "
-        + ", ".join(f"{row}: on a {share}th of them" for row, share in SLOW.items())
+        + ", ".join(f"{row}: on one in {share} of them" for row, share in SLOW.items())
         + "."
     ),
 )
