@@ -11,10 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from learning import environment, quick_training
+from learning import environment, published, quick_training, scales
 
 import swarmnet.reproduce.work
-from gnn.config import TrainConfig
+from gnn.checkpoint import Model
+from gnn.config import TrainConfig, model_preset
+from gnn.decode import Integrator
 from swarm_mjcf.errors import SpecError, SwarmError
 from swarmnet.cli import main, parse
 from swarmnet.commands import reproduce as command
@@ -460,11 +462,22 @@ def test_a_crowd_is_tested_with_the_network_of_the_same_row_and_seed(tmp_path: P
     assert found == {  # 1000 agents + scenes
         ("swarmnet best", "boids"): {"boids N=5": 5500, "boids N=10": 10500, "boids N=20": 20125},
         ("swarmnet best", "boids crowd"): {"boids N=200": 200_007},
-        ("kipf", "boids"): {"boids N=5": 5063, "boids N=10": 10063, "boids N=20": 20016},  # an eighth
+        ("kipf", "boids"): {"boids N=5": 5500, "boids N=10": 10500, "boids N=20": 20125},
         ("seq2seq", "boids"): {"boids N=10": 10500},
     }
     others = [(Learning(model=name, seed=2), 10) for name in ("kipf", "seq2seq")]
     assert sorted(learned, key=str) == sorted([*[(Learning(model="best", seed=2), 10)] * 2, *others], key=str)
+
+
+@pytest.mark.parametrize(("name", "tested"), [("kipf", 2), ("thesis-ch3", 9)])
+def test_kipf_is_tested_on_an_eighth_of_the_scenes(name: str, tested: int, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        swarmnet.reproduce.work, "published_mean", lambda *given, **_: seen.append(len(given[2])) or float(len(seen))
+    )
+    model = Model(model_preset(name), scales(), Integrator(0.3, 15, 10.0, 5.0), {}, {})
+    found = swarmnet.reproduce.work.errors(model, published(9, 12), (5, 40), ("near", "far"))
+    assert (seen, found) == ([tested] * 2, {"near": 1, "far": 2})
 
 
 def test_a_real_cell_trains_tests_and_goes_on_where_it_was(tmp_path: Path, monkeypatch):

@@ -19,7 +19,7 @@ from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
 from swarmnet.reproduce.shown import STEPS, file_name, first_of_rows, panels, show, small_print, write
 from swarmnet.reproduce.table_3_1 import HORIZONS as TABLE
 from swarmnet.reproduce.table_3_1 import MODELS, WORLDS, columns
-from swarmnet.reproduce.work import TEST_SEED, demonstrations, errors, unseen
+from swarmnet.reproduce.work import SLOWLY, TEST_SEED, demonstrations, errors, unseen
 
 BOIDS, CHASER = WORLDS["boids"], WORLDS["chaser"]
 SWARMNETS = ("swarmnet best", "swarmnet thesis-ch3 context")
@@ -179,6 +179,6 @@ FIGURE_3_8 = Experiment(
     data_sets=(DataSet("chaser", (*columns("chaser"), *SAMPLES[:2])),),
     run=run_3_8,
     leading=SWARMNETS[:1],
-    notes=SHOWN_NOTE,
+    notes=f"{SLOWLY} {SHOWN_NOTE}",
     figure=draw_3_8,
 )

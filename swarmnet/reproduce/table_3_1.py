@@ -6,7 +6,7 @@ from envs.config import SimulateConfig
 from gnn.evaluate import constant_velocity, persistence
 from swarmnet.progress import Update
 from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
-from swarmnet.reproduce.work import demonstrations, errors, published_mean, trained, unseen
+from swarmnet.reproduce.work import SLOWLY, demonstrations, errors, published_mean, trained, unseen
 
 MODELS = {
     "swarmnet best": "best",
@@ -74,4 +74,5 @@ TABLE_3_1 = Experiment(
     references=references(),
     leading=("swarmnet best",),
     untrained=BASELINES,
+    notes=SLOWLY,
 )

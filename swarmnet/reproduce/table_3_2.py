@@ -5,7 +5,7 @@ from pathlib import Path
 from envs.config import SimulateConfig
 from swarmnet.progress import Update
 from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
-from swarmnet.reproduce.work import demonstrations, errors, trained, unseen
+from swarmnet.reproduce.work import SLOWLY, demonstrations, errors, trained, unseen
 
 MODELS = {
     "swarmnet best": "best",
@@ -46,4 +46,5 @@ TABLE_3_2 = Experiment(
     run=run,
     references={(row, column): v for row, both in THESIS.items() for column, v in zip(COLUMNS, both, strict=True)},
     leading=("swarmnet best",),
+    notes=SLOWLY,
 )

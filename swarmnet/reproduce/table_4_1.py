@@ -7,7 +7,7 @@ from envs.config import SimulateConfig
 from swarmnet.progress import Update
 from swarmnet.reproduce.borrow import Learning, trained_once
 from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
-from swarmnet.reproduce.work import demonstrations, errors, few, unseen
+from swarmnet.reproduce.work import SLOWLY, demonstrations, errors, few, unseen
 
 MODELS = {
     "swarmnet best": "best",
@@ -20,8 +20,6 @@ TRAINED, SIZES, HORIZON = 10, (5, 10, 20), 40
 CROWD, CROWD_SHARE = 200, 64
 """Agents of the crowd, and the share of its unseen scenes: each has as many pairs as 400 scenes of ten."""
 CROWDED = {f"{data} crowd": data for data in WORLDS}
-SLOW = {"kipf": 8}
-"""Rows that are tested on a part of the unseen scenes: the cost of Kipf's encoder grows with the pairs."""
 THESIS = {
     "swarmnet best": {"boids": (0.93, 0.41, 1.69), "helbing": (0.24, 0.05, 0.32)},
     "swarmnet thesis-ch3 context": {"boids": (0.93, 0.41, 1.69), "helbing": (0.24, 0.05, 0.32)},
@@ -45,11 +43,10 @@ def run(cell: Cell, effort: Effort, folder: Path, progress: Update) -> dict[str,
     tests = {size: few(effort, size) for size in SIZES}
     if cell.data in CROWDED:
         tests = {CROWD: replace(effort, test_scenes=max(1, effort.test_scenes // CROWD_SHARE))}
-    share, found = SLOW.get(cell.row, 1), {}
+    found = {}
     for (size, scenes), column in zip(tests.items(), columns(cell.data), strict=True):
         if cell.row != "seq2seq" or size == TRAINED:
-            test = unseen(replace(world, num_agents=size), replace(scenes, test_scenes=-(-scenes.test_scenes // share)))
-            found |= errors(model, test, (HORIZON,), (column,))
+            found |= errors(model, unseen(replace(world, num_agents=size), scenes), (HORIZON,), (column,))
     return found
 
 
@@ -68,9 +65,5 @@ TABLE_4_1 = Experiment(
         if value is not None
     },
     leading=("swarmnet best",),
-    notes=(
-        f"N={CROWD}: the network of the row's other columns on a {CROWD_SHARE}th of the unseen scenes. "
-        + ", ".join(f"{row}: on one in {share} of them" for row, share in SLOW.items())
-        + "."
-    ),
+    notes=f"N={CROWD}: the network of the row's other columns on a {CROWD_SHARE}th of the unseen scenes. {SLOWLY}",
 )
