@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from envs.dynamics import free_flight, limited
+from envs.dynamics import Kinematics, free_flight, limited
 from envs.policy import Policy
 from envs.record import Array
 from envs.state import State
@@ -31,6 +31,28 @@ class Integrator:
     """[m/s]"""
     max_acceleration: float
     """[m/s^2]"""
+
+
+def steered(
+    last: Float[Array, "B V 4"],
+    acceleration: Float[Array, "B n 2"],
+    graph: Graph,
+    kinematics: Kinematics,
+    *,
+    clip: bool,
+) -> Float[Array, "B V 4"]:
+    """Node states one control step later. Goals stand still, obstacles keep their velocity: neither is steered.
+
+    `clip`: within the limits of acceleration and speed.
+    """
+    first = last.shape[1] - acceleration.shape[1]
+    position, velocity = last[:, first:, :2], last[:, first:, 2:]
+    if clip:
+        acceleration = limited(velocity, acceleration, kinematics)
+    here = graph.present[:, first:, None]
+    after = jnp.concatenate(free_flight(position, velocity, jnp.where(here, acceleration, 0), kinematics), axis=-1)
+    context = jnp.asarray(last[:, :first]).at[..., :2].add(last[:, :first, 2:] * kinematics.dt)
+    return jnp.concatenate([context, jnp.where(here, after, last[:, first:])], axis=1)
 
 
 def network(config: ModelConfig, scales: Scales) -> Callable[..., Array]:
@@ -67,15 +89,7 @@ def make_predict(config: ModelConfig, scales: Scales, integrator: Integrator) ->
         last = history[:, -1]
         if config.output == "state_change":
             return last + out
-        first = last.shape[1] - out.shape[1]
-        position, velocity = last[:, first:, :2], last[:, first:, 2:]
-        if config.clip:
-            out = limited(velocity, out, integrator)
-        here = graph.present[:, first:, None]
-        after = jnp.concatenate(free_flight(position, velocity, jnp.where(here, out, 0), integrator), axis=-1)
-        # Goals stand still, obstacles keep their velocity: neither is steered.
-        context = jnp.asarray(last[:, :first]).at[..., :2].add(last[:, :first, 2:] * integrator.dt)
-        return jnp.concatenate([context, jnp.where(here, after, last[:, first:])], axis=1)
+        return steered(last, out, graph, integrator, clip=config.clip)
 
     def predict(
         params: Params, history: Array, graph: Graph, *, horizon: int, key: jax.Array | None = None

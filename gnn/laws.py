@@ -1,20 +1,27 @@
-"""What an expert's law says of one edge type, alone or between two bodies: the truth beside learned edge functions."""
+"""An expert's law beside what was learned: of one edge type, between two bodies, and as a predictor of its own."""
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from envs.config import World
 from envs.experts.config import BoidsConfig, ChaserConfig, ExpertConfig, HelbingConfig, expert_name
 from envs.experts.registry import make_expert
+from envs.noise import ActuationNoise, with_actuation_noise
 from envs.record import Array
 from envs.state import make_state
-from gnn.graph import EDGE_TYPES
+from gnn.decode import steered
+from gnn.family import Params, Predict
+from gnn.graph import EDGE_TYPES, Graph
 from swarm_mjcf.errors import SpecError, SwarmError
+
+NO_NOISE = ActuationNoise()
 
 
 class LawError(SwarmError):
-    """The expert has no law that belongs to edge types."""
+    """The expert has no law that belongs to edge types, or none that a graph's states are enough for."""
 
 
 def check_kinds(kinds: tuple[str, ...]) -> None:
@@ -74,3 +81,41 @@ def pair_force(
     if kind == "obstacle":
         force = force - policy(replace(state, obstacle_present=jnp.zeros((pairs, 1), bool)), None, None)
     return force[:, 0]
+
+
+def law_predict(world: World, noise: ActuationNoise = NO_NOISE) -> Predict:
+    """The law itself as a predictor, with errors of a known size: what a model that is wrong by this much would get.
+
+    Without noise it continues recordings of the same world (without contacts) to the rounding of float32. Noise is
+    drawn anew for every window, agent and step, the same in every call without a `key`. Raises LawError for chasers,
+    whose targets are no part of a graph's states.
+    """
+    if isinstance(world.expert, ChaserConfig):
+        raise LawError("chasers' targets are not known to a predictor; boids, helbing or vicsek are needed")
+    policy = with_actuation_noise(make_expert(world.expert), noise)
+
+    def predict(
+        params: Params, history: Array, graph: Graph, *, horizon: int, key: jax.Array | None = None
+    ) -> Float[Array, "B h V 4"]:
+        goals, obstacles, _ = graph.counts
+        first = goals + obstacles
+
+        def step(nodes: Array, key: jax.Array):
+            around, agents = nodes[:, goals:first], nodes[:, first:]
+            state = make_state(
+                position=agents[..., :2],
+                velocity=agents[..., 2:],
+                goal=nodes[:, 0, :2] if goals else jnp.zeros((len(nodes), 2), nodes.dtype),
+                obstacle=around[..., :2],
+                obstacle_velocity=around[..., 2:],
+                agent_present=graph.present[:, first:],
+                obstacle_present=graph.present[:, goals:first],
+            )
+            wanted = policy(state, None, jax.random.split(key, len(nodes)))
+            nodes = steered(nodes, wanted, graph, world.scene, clip=True)
+            return nodes, nodes
+
+        keys = jax.random.split(jax.random.key(0) if key is None else key, horizon)
+        return jnp.swapaxes(jax.lax.scan(step, jnp.asarray(history[:, -1]), keys)[1], 0, 1)
+
+    return predict

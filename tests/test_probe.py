@@ -8,14 +8,19 @@ import pytest
 from by_hand import COUNTS, FREE, LAW, by_hand, flock, linear, random_model
 from learning import complete, quick_compiles, random_swarm, scales
 
+from envs.config import SimulateConfig, make_world
 from envs.experts.config import BoidsConfig, ChaserConfig, HelbingConfig, VicsekConfig
+from envs.noise import ActuationNoise
+from envs.simulate import simulate
+from envs.storage import load
 from gnn.baselines.config import PRESETS as RIVALS
 from gnn.checkpoint import Model
 from gnn.contributions import NOTHING, along, contributions, only_edges
 from gnn.decode import network
+from gnn.evaluate import prediction_error
 from gnn.force_fields import ForceField, effect, force_field, r_squared
 from gnn.graph import EDGE_TYPES
-from gnn.laws import LawError, pair_force, same_rules
+from gnn.laws import LawError, law_predict, pair_force, same_rules
 from gnn.messages import NoEdgeFunctionsError, acceleration, edge_kinds, messages, swarmnet_config
 from gnn.probe import fit_linear, linear_probe
 from swarm_mjcf.errors import SpecError
@@ -241,3 +246,30 @@ def test_parts_of_a_sum_of_forces_are_the_forces():
     np.testing.assert_allclose(np.asarray(lines["agent"].get_xdata()), 0.1 * np.arange(6))
     assert set(lines) == {"all", NOTHING, *EDGE_TYPES}
     assert "agent 3" in svg(figure) or figure.axes[1].get_title(loc="left") == "agent 3"
+
+
+@pytest.mark.parametrize("preset", ["published", "helbing"])
+def test_the_law_as_a_predictor_continues_recordings(preset: str, tmp_path):
+    simulate(SimulateConfig(preset=preset, scenes=12, num_agents=4, steps=24, mixed=True), tmp_path / "data.h5")
+    found = prediction_error(law_predict(make_world(preset)), {}, load(tmp_path / "data.h5"), window=1, horizons=(20,))
+    assert found.published_mean[0] < 1e-6
+
+
+def test_the_noise_of_a_law_has_the_size_asked_for():
+    """One step without limits: noise u of standard deviation s changes the velocity by u dt, the position by u dt^2."""
+    world, s = make_world("published"), 0.05
+    world = replace(world, scene=replace(world.scene, max_speed=np.inf, max_acceleration=np.inf))
+    history, _, graph = random_swarm(0, (1, 1, 4), batch=500)
+    quiet = law_predict(world)({}, history, graph, horizon=1)
+    loud = law_predict(world, ActuationNoise(std=s))({}, history, graph, horizon=1)
+    off, dt = np.asarray(loud - quiet)[:, 0], world.scene.dt
+    assert not off[:, :2].any()
+    done = off[:, 2:, 2:] / dt
+    np.testing.assert_allclose(off[:, 2:, :2], done * dt**2, atol=1e-4)
+    np.testing.assert_allclose(done.std(), s, rtol=0.05)
+    np.testing.assert_allclose(done.mean(), 0, atol=0.004)
+
+
+def test_the_law_of_chasers_is_no_predictor():
+    with pytest.raises(LawError, match="chasers"):
+        law_predict(make_world("chaser"))
