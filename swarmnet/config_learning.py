@@ -259,9 +259,9 @@ class Learn:
     """Trajectories to judge on; NAME_holdout.h5 beside the data by default."""
     model: str = "crowd"
     """Preset of the model."""
-    horizons: tuple[int, ...] = (1, 2, 5, 10)
-    """Predicted steps in each stage of the curriculum."""
-    stage_steps: tuple[int, ...] = (1000, 400, 200, 200)
+    horizons: tuple[int, ...] = (1, 2, 5, 10, 20)
+    """Predicted steps in each stage of the curriculum; stages that do not fit into the recorded scenes are left out."""
+    stage_steps: tuple[int, ...] = (1000, 400, 200, 200, 200)
     """Gradient steps in each stage."""
     scale: float = 1.0
     """Factor on the number of gradient steps of every stage."""

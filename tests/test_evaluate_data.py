@@ -182,6 +182,13 @@ def test_learning_from_a_file_to_a_report(here: Path, monkeypatch: pytest.Monkey
         learn.run(Learn(data=holdout_path(Path("w.h5"))))
 
 
+def test_predictions_that_scenes_are_too_short_for_are_not_learned():
+    training = TrainConfig(horizons=(1, 5, 20), stage_steps=(300, 200, 100))
+    assert learn.fitting(training, 20) == training
+    assert learn.fitting(training, 19) == replace(training, horizons=(1, 5), stage_steps=(300, 200))
+    assert learn.fitting(training, 0) == training, "what is too short for everything is refused by who cuts"
+
+
 def test_training_and_validation_share_no_rows(here: Path):
     data = load("w.h5")
     scenes = data.take(np.arange(40) % len(data))

@@ -35,16 +35,17 @@ def run(config: Learn) -> int:
         )
     recorded = limited(load(config.data))
     recorded = replace(recorded, provenance=recorded.provenance | {"learn": {"data": str(config.data)}})
-    window, longest = model_preset(config.model).window, max(config.horizons)
-    learned, checked = apart(recut(recorded, window + longest, stride=STRIDE), -(-(window + longest) // STRIDE))
-    present = (learned.mask & (learned.kind == AGENT)[:, None]).sum(axis=2)
     training = TrainConfig(
-        model=config.model,
-        seed=config.seed,
-        horizons=config.horizons,
-        stage_steps=config.stage_steps,
-        batch=int(np.clip(round(AGENTS / present[present > 0].mean()), 4, 128)),
+        model=config.model, seed=config.seed, horizons=config.horizons, stage_steps=config.stage_steps
     ).scaled(config.scale)
+    window, rows = model_preset(config.model).window, recorded.position.shape[1]
+    training = fitting(training, rows - window)
+    if training.horizons != config.horizons:
+        print(f"scenes of {rows} rows: predictions are learned up to {max(training.horizons)} steps")
+    needed = window + max(training.horizons)
+    learned, checked = apart(recut(recorded, needed, stride=STRIDE), -(-needed // STRIDE))
+    present = (learned.mask & (learned.kind == AGENT)[:, None]).sum(axis=2)
+    training = replace(training, batch=int(np.clip(round(AGENTS / present[present > 0].mean()), 4, 128)))
     with progress(f"train {config.model}") as update:
         train(
             training,
@@ -55,6 +56,15 @@ def run(config: Learn) -> int:
         )
     conclude(judge_recorded(model_source(config.run), holdout, config.run), config.run, videos=config.videos)
     return 0
+
+
+def fitting(training: TrainConfig, rows: int) -> TrainConfig:
+    """Without the stages that predict more than `rows` steps; with all of them where none would be left."""
+    stages = [stage for stage in zip(training.horizons, training.stage_steps, strict=True) if stage[0] <= rows]
+    if not stages:
+        return training
+    horizons, steps = zip(*stages, strict=True)
+    return replace(training, horizons=horizons, stage_steps=steps)
 
 
 def apart(scenes: Trajectories, gap: int) -> tuple[Trajectories, Trajectories]:
