@@ -71,12 +71,20 @@ def _flat(row: Row) -> dict:
 
 
 def _command(arguments: list[str]) -> str:
-    """The command that measures this again; where its results were written is nobody's business."""
+    """The command that measures this again. Where its results were written is nobody's business, nor are the folders
+    above those that it read: paths are said from here, and those elsewhere by their names."""
     kept = list(arguments)
     if "--json" in kept:
         at = kept.index("--json")
         del kept[at : at + 2]
-    return " ".join(["swarmnet", *kept])
+    return " ".join(["swarmnet", *(_from_here(word) for word in kept)])
+
+
+def _from_here(word: str) -> str:
+    path = Path(word)
+    if not path.is_absolute():
+        return word
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else path.name
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -1,11 +1,12 @@
 """The documents do not lie: their code runs, and the results page is what the committed results say."""
 
+import json
 import re
 from pathlib import Path
 
 import pytest
 
-from swarmnet.results import render_page
+from swarmnet.results import _command, render_page
 
 ROOT = Path(__file__).parent.parent
 
@@ -35,6 +36,17 @@ def test_the_code_of_the_interfaces_page_runs(capsys: pytest.CaptureFixture) -> 
 
 def test_the_results_page_is_rendered_from_the_committed_results() -> None:
     assert (ROOT / "docs/results.md").read_text() == render_page(ROOT / "docs/results")
+
+
+def test_committed_results_name_no_folder_of_a_machine() -> None:
+    for path in sorted((ROOT / "docs/results").glob("*.json")):
+        assert not re.search(r"(?<![\w.])/\w+/", json.loads(path.read_text())["command"]), path
+
+
+def test_a_command_says_paths_from_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = _command(["bench", "x", "--run", str(tmp_path / "runs" / "a"), "--data", "/elsewhere/b", "--json", "c.json"])
+    assert said == "swarmnet bench x --run runs/a --data b"
 
 
 def test_commands_that_the_documents_name_exist() -> None:
