@@ -269,6 +269,8 @@ class Learn:
     """Initial weights and data order."""
     videos: int = 3
     """Windows to make videos of."""
+    json: Path | None = None
+    """Also write the results here, machine-readable."""
 
     def __post_init__(self) -> None:
         if not 0 < self.scale < float("inf"):

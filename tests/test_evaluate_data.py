@@ -163,13 +163,20 @@ def test_learning_from_a_file_to_a_report(here: Path, monkeypatch: pytest.Monkey
     def trained(config: TrainConfig, data, run: Path, **more) -> None:
         seen.update(config=config, data=data, validation=more["validation"])
 
+    def recorded(*given) -> Judgement:
+        seen["judgement"] = judge_recorded(*given)
+        return seen["judgement"]
+
     monkeypatch.setattr(learn, "train", trained)
     monkeypatch.setattr(learn, "model_source", lambda run: model_source(Path("thesis-ch5")))
-    monkeypatch.setattr(learn, "conclude", lambda judgement, run, *, videos: seen.update(judgement=judgement))
+    monkeypatch.setattr("swarmnet.commands.evaluate.write_report", lambda run: run)
+    monkeypatch.setattr(learn, "judge_recorded", recorded)
     config = Learn(
-        data=Path("w.h5"), run=Path("r"), model="thesis-ch5", horizons=(1, 3), stage_steps=(200, 100), scale=0.5
-    )
+        data=Path("w.h5"), run=Path("r"), model="thesis-ch5", horizons=(1, 3), stage_steps=(200, 100), scale=0.5,
+        videos=0, json=Path("learned.json"),
+    )  # fmt: skip
     assert learn.run(config) == 0
+    rows = {(row["row"], row["column"]): row["value"] for row in json.loads(Path("learned.json").read_text())["rows"]}
     training, data, judgement = seen["config"], seen["data"], seen["judgement"]
     assert isinstance(training, TrainConfig)
     assert isinstance(judgement, Judgement)
@@ -178,6 +185,7 @@ def test_learning_from_a_file_to_a_report(here: Path, monkeypatch: pytest.Monkey
     assert data.position.shape[1] == 1 + 3  # pyright: ignore[reportAttributeAccessIssue]
     assert 1.0 < data.max_speed < 2.0, "half more than the 1 m/s of everybody"  # pyright: ignore[reportAttributeAccessIssue]
     assert judgement.data == "w_holdout.h5"
+    assert rows["swarmnet thesis-ch5", "fde 10 steps"] == judgement.prediction["swarmnet thesis-ch5"].fde[-1]
     with pytest.raises(SwarmError, match=r"w_holdout_holdout.h5: does not exist; import with --holdout"):
         learn.run(Learn(data=holdout_path(Path("w.h5"))))
 

@@ -54,7 +54,8 @@ def run(config: Learn) -> int:
             validation=checked,
             progress=lambda done, total, row: update(done, total, note(row)),
         )
-    conclude(judge_recorded(model_source(config.run), holdout, config.run), config.run, videos=config.videos)
+    judgement = judge_recorded(model_source(config.run), holdout, config.run)
+    conclude(judgement, config.run, videos=config.videos, json=config.json)
     return 0
 
 
