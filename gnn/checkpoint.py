@@ -17,6 +17,7 @@ from gnn.config import AnyModelConfig, config_kinds
 from gnn.decode import Integrator
 from gnn.family import Params, Predict
 from gnn.features import Scales
+from gnn.ranges import joined
 from gnn.registry import make_family
 from swarm_mjcf.errors import SwarmError
 
@@ -48,6 +49,15 @@ class Model:
             return [*about["data"].get("mixed", [about["data"]]), *(parts(before) if before else [])]
 
         return parts(self.about)
+
+    @property
+    def seen(self) -> dict[str, list[float]] | None:
+        """Range of all data that it has learned from (`gnn.ranges`), also before tuning; None where none is stored."""
+        ranges, about = [], self.about
+        while about:
+            ranges += [about["range"]] if about.get("range") else []
+            about = about.get("initial")
+        return joined(ranges) if ranges else None
 
     @cached_property
     def predict(self) -> Predict:

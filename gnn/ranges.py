@@ -1,6 +1,7 @@
 """What a model has seen: agents at a time, speeds, distances to the nearest other. Plain figures for its checkpoint."""
 
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -8,6 +9,8 @@ from scipy.spatial import KDTree
 
 from envs.trajectories import AGENT, Trajectories
 
+Figures = Mapping[str, Sequence[float]]
+"""Of each quantity `[1%, median, 99%, largest]`."""
 QUANTITIES = {"agents": "", "speed": "m/s", "spacing": "m"}
 """What is measured, with its unit."""
 SHARES = (0.01, 0.5, 0.99)
@@ -25,6 +28,16 @@ def figures_of(trajectories: Trajectories) -> dict[str, list[float]]:
         for name, values in samples_of(trajectories).items()
         if len(values)
     }
+
+
+def joined(ranges: Sequence[Figures]) -> dict[str, list[float]]:
+    """What was seen in all of several data sets: the span of their figures. The median is the first's."""
+    found = {}
+    for name in QUANTITIES:
+        if parts := [figures[name] for figures in ranges if name in figures]:
+            low, median, high, largest = zip(*parts, strict=True)
+            found[name] = [min(low), median[0], max(high), max(largest)]
+    return found
 
 
 def samples_of(trajectories: Trajectories) -> dict[str, Float[np.ndarray, " n"]]:

@@ -248,7 +248,7 @@ def judge_recorded(source: Source, data: Path, folder: Path, *, label: str = "")
 
 
 def _said(source: Source, truth: Trajectories) -> tuple[str, ...]:
-    line = out_of_range(source.model.about.get("range"), truth) if source.model is not None else None
+    line = out_of_range(source.model.seen, truth) if source.model is not None else None
     return (line,) if line else ()
 
 

@@ -1,11 +1,9 @@
 """Whether data are like those a model was trained on: one line where they are not, never an error."""
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from envs.trajectories import Trajectories
-from gnn.ranges import QUANTITIES, samples_of
+from gnn.ranges import QUANTITIES, Figures, samples_of
 
 OUTSIDE = 0.1
 """Share outside the training data's 1% to 99% that is worth a warning; data of the same kind have 0.02."""
@@ -13,11 +11,11 @@ _ROUNDING = 1e-3
 _WORDS = {"agents": "agents at a time", "speed": "speed", "spacing": "distance to the nearest other"}
 
 
-def out_of_range(seen: Mapping[str, Sequence[float]] | None, given: Trajectories) -> str | None:
+def out_of_range(seen: Figures | None, given: Trajectories) -> str | None:
     """What is outside the range that a model saw, in one line; None where nothing is or nobody wrote down what it saw.
 
     Args:
-      seen: `gnn.ranges.figures_of` the training data, as a checkpoint keeps it (`about["range"]`).
+      seen: `gnn.ranges.figures_of` the training data, as a model knows it (`Model.seen`).
       given: what the model is used on.
     """
     parts = []

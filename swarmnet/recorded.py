@@ -62,7 +62,7 @@ def holdout_of(source: Source, data: Path) -> tuple[Trajectories, list[str]]:
             f"{trajectories.dt:g} s apart with {trajectories.substeps}; import the recording with --dt {trained.dt:g}"
         )
     _check_nodes(model, trajectories, data)
-    said = [out_of_range(model.about.get("range"), trajectories), _own(model, trajectories, data)]
+    said = [out_of_range(model.seen, trajectories), _own(model, trajectories, data)]
     return trajectories, [line for line in said if line]
 
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import by_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.trajectories import AGENT, GOAL, Trajectories, edge_types
-from gnn.ranges import figures_of, samples_of
+from gnn.ranges import figures_of, joined, samples_of
 from swarmnet.out_of_range import out_of_range
 
 
@@ -93,6 +94,29 @@ def test_everything_outside_is_in_one_line():
     assert line is not None
     assert "\n" not in line
     assert [word in line for word in ("agents at a time 9", "speed 0.1", "nearest other 30 m")] == [True] * 3
+
+
+def test_a_tuned_model_has_seen_what_it_learned_from_before():
+    five, ten, twenty = (marching(agents, apart=10 / agents) for agents in (5, 10, 20))
+    first = {"range": figures_of(five)}
+    tuned = replace(by_hand(), about={"range": figures_of(ten), "initial": first})
+    assert tuned.seen is not None
+    assert [out_of_range(tuned.seen, data) for data in (five, ten)] == [None, None]
+    assert out_of_range(figures_of(ten), five) is not None, "the data of tuning alone are not like those"
+    line = out_of_range(tuned.seen, twenty)
+    assert line is not None
+    assert "agents at a time 20, trained on 5 to 10 (100% outside)" in line
+    again = replace(tuned, about={"range": figures_of(twenty), "initial": tuned.about})
+    assert again.seen is not None
+    assert (again.seen["agents"], again.seen["spacing"]) == ([5, 20, 20, 20], pytest.approx([0.5, 0.5, 2, 2], rel=1e-4))
+    assert replace(tuned, about={"initial": {"range": None}}).seen is None
+    assert replace(tuned, about={"initial": first}).seen == first["range"]
+
+
+def test_what_only_one_of_two_data_sets_has_is_kept():
+    alone, two = figures_of(marching(1)), figures_of(marching(2, speed=3))
+    both = joined([alone, two])
+    assert both == {"agents": [1, 1, 2, 2], "speed": [1, 1, 3, 3], "spacing": two["spacing"]}
 
 
 @settings(max_examples=20, deadline=None)

@@ -102,6 +102,9 @@ def test_later_stages_tune_on_the_mix_with_the_edge_functions_locked(tmp_path: P
     )  # fmt: skip
     assert set(seen) == {"2->3"}
     assert_same(again.params, one.params)
+    assert tuned.about["range"]["agents"] == [3] * 4
+    assert tuned.seen is not None
+    assert tuned.seen["agents"] == [2, 3, 3, 3]
     assert not np.array_equal(
         tuned.params["edge"]["goal"]["layer0"]["kernel"], one.params["edge"]["goal"]["layer0"]["kernel"]
     )
