@@ -22,7 +22,7 @@ from envs.plain import plain
 from envs.record import Array
 from envs.trajectories import Trajectories
 from gnn.checkpoint import CheckpointError, Checkpoints, Model, describe
-from gnn.config import AnyModelConfig, TrainConfig, model_preset
+from gnn.config import AnyModelConfig, ModelConfig, TrainConfig, model_preset
 from gnn.decode import Integrator
 from gnn.evaluate import natural_change
 from gnn.family import Family, Params
@@ -61,7 +61,8 @@ def train(
     paths of the weights (`edge/*`); what they match stays as it is (`gnn.freeze`).
 
     Raises TrajectoryError for trajectories too short, SpecError for an initial model of another kind and for patterns
-    that match nothing, CheckpointError for a folder of other settings or data, TrainError when the loss diverges.
+    that match nothing, SwarmError for an initial model of another dt (or substeps, if it predicts accelerations),
+    CheckpointError for a folder of other settings or data, TrainError when the loss diverges.
     """
     prepared = prepare(config, trajectories, validation=validation, initial=initial, freeze=freeze)
     return train_prepared(prepared, folder, progress=progress)
@@ -136,8 +137,10 @@ def prepare(
     check_rows(trajectories, preset.window + furthest, f"a horizon of {furthest} steps")
     if validation is not None:
         check_rows(validation, preset.window + furthest, f"a validation of {furthest} steps")
-    if initial is not None and initial.config != preset:
-        raise SpecError("model", config.model, f"the initial model's preset, {initial.about.get('preset')}")
+    if initial is not None:
+        if initial.config != preset:
+            raise SpecError("model", config.model, f"the initial model's preset, {initial.about.get('preset')}")
+        _check_step(initial, trajectories)
     scales = Scales.of(trajectories) if initial is None else initial.scales
     integrator = Integrator(
         trajectories.dt, trajectories.substeps, trajectories.max_speed, trajectories.max_acceleration
@@ -242,6 +245,18 @@ def fingerprint(params: Params) -> str:
     for path, leaf in zip(paths_of(params), jax.tree.leaves(params), strict=True):
         found.update(path.encode() + np.asarray(leaf).tobytes())
     return found.hexdigest()[:16]
+
+
+def _check_step(initial: Model, trajectories: Trajectories) -> None:
+    """Raises SwarmError unless the data have the control step that the weights were learned for."""
+    had, config = initial.integrator, initial.config
+    # Only an acceleration becomes a state by way of the substeps.
+    substeps = isinstance(config, ModelConfig) and config.output == "acceleration"
+    if abs(had.dt - trajectories.dt) > 1e-6 or (substeps and had.substeps != trajectories.substeps):
+        raise SwarmError(
+            f"the initial model was trained at dt {had.dt:g} s with {had.substeps} substeps, the data have rows "
+            f"{trajectories.dt:g} s apart with {trajectories.substeps}; tuning needs data like those"
+        )
 
 
 def _check_weights(params: Params, shapes: Params) -> None:

@@ -15,7 +15,7 @@ from gnn.checkpoint import Model, load_model
 from gnn.config import TrainConfig
 from gnn.freeze import free_leaves, freeze, frozen, paths_of
 from gnn.train import prepare, train
-from swarm_mjcf.errors import SpecError
+from swarm_mjcf.errors import SpecError, SwarmError
 
 PARAMS = {
     "edge": {"goal": {"kernel": jnp.asarray([1.0, -2.0])}, "agent": {"kernel": jnp.asarray([3.0])}},
@@ -110,9 +110,23 @@ def test_parts_can_be_locked_as_they_were_drawn(tmp_path: Path, first: Model):
 def test_what_does_not_fit_is_refused(tmp_path: Path, first: Model):
     with pytest.raises(SpecError, match="thesis-ch5"):
         train(replace(SHORT, model="best"), spring(), tmp_path / "run", initial=first)
+    said = r"trained at dt 0\.1 s with 1 substeps, the data have rows 0\.2 s apart with 1; tuning needs data like"
+    with pytest.raises(SwarmError, match=said):
+        train(SHORT, replace(spring(), dt=0.2), tmp_path / "run", initial=first)
+    with pytest.raises(SwarmError, match=r"rows 0\.1 s apart with 4"):
+        train(SHORT, replace(spring(), substeps=4), tmp_path / "run", initial=first)
     lacking = replace(first, params={name: part for name, part in first.params.items() if name != "edge"})
     with pytest.raises(SpecError, match="edge/goal/layer0/kernel"):
         train(SHORT, spring(), tmp_path / "run", initial=lacking)
     with pytest.raises(SpecError, match=r"matches some of .*edge/goal"):
         train(SHORT, spring(), tmp_path / "run", freeze=("edges/*",))
     assert not (tmp_path / "run").exists()
+
+
+def test_changes_of_state_are_tuned_on_any_substeps_but_on_no_other_dt():
+    config, data = replace(SHORT, model="thesis-ch3"), spring()
+    beginning = prepare(config, data)
+    first = Model(beginning.preset, beginning.scales, beginning.integrator, beginning.start()["params"], {})
+    assert prepare(config, replace(data, substeps=4), initial=first).integrator.substeps == 4
+    with pytest.raises(SwarmError, match=r"rows 0\.2 s apart"):
+        prepare(config, replace(data, dt=0.2), initial=first)
