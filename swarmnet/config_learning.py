@@ -287,14 +287,16 @@ class Probe:
 
     Example:
       swarmnet probe runs/clear
+      swarmnet probe runs/walks --data runs/walks_holdout.h5
     """
 
     run: Path
     """Run folder with a trained model."""
     data: Path | None = None
-    """Trajectories to look at; by default unseen scenes of the training world."""
+    """Trajectories to look at, simulated or imported; by default unseen scenes of the training world, or the recording
+    that the model learned from."""
     scenes: int = 100
-    """Scenes to look at, at least 4."""
+    """Scenes to look at; the linear probe needs 4."""
     scene: int = 0
     """Scene whose contributions are drawn over time."""
     seed: int = 1_000_000

@@ -54,19 +54,20 @@ def holdout_of(source: Source, data: Path) -> tuple[Trajectories, list[str]]:
     model, trajectories = source.model, load(data)
     if model is None:
         raise PolicyError(f"policy {source.given!r}: predicts nothing; --data needs a run folder with a trained model")
-    check_rows(trajectories, model.config.window + 1, f"a prediction of 1 step from {model.config.window}")
     trained = model.integrator
     if abs(trained.dt - trajectories.dt) > 1e-6 or trained.substeps != trajectories.substeps:
         raise SwarmError(
             f"the model was trained at dt {trained.dt:g} s with {trained.substeps} substeps, {data} has rows "
             f"{trajectories.dt:g} s apart with {trajectories.substeps}; import the recording with --dt {trained.dt:g}"
         )
-    _check_nodes(model, trajectories, data)
+    check_data(model, trajectories, data)
     said = [out_of_range(model.seen, trajectories), _own(model, trajectories, data)]
     return trajectories, [line for line in said if line]
 
 
-def _check_nodes(model: Model, trajectories: Trajectories, data: Path) -> None:
+def check_data(model: Model, trajectories: Trajectories, data: Path) -> None:
+    """Raises TrajectoryError for rows too few to predict, PolicyError for other kinds of nodes than the model's."""
+    check_rows(trajectories, model.config.window + 1, f"a prediction of 1 step from {model.config.window}")
     one, zero = trajectories.take([0]), jnp.zeros(1, jnp.int32)
     history, _, _, graph = windows(
         Dataset.of(one), zero, zero, window=model.config.window, horizon=1, counts=trajectories.counts

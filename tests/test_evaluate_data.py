@@ -19,9 +19,9 @@ from gnn.evaluate import constant_velocity, prediction_error
 from gnn.ranges import figures_of
 from gnn.train import train
 from swarm_mjcf.errors import SwarmError
-from swarmnet.commands import learn
+from swarmnet.commands import learn, probe
 from swarmnet.commands.evaluate import run as evaluate
-from swarmnet.config import Evaluate, Learn
+from swarmnet.config import Evaluate, Learn, Probe
 from swarmnet.judge import Judgement, judge_recorded, training_world
 from swarmnet.policies import Source, find_policy, model_source
 from swarmnet.report import write_report
@@ -188,6 +188,71 @@ def test_learning_from_a_file_to_a_report(here: Path, monkeypatch: pytest.Monkey
     assert rows["swarmnet thesis-ch5", "fde 10 steps"] == judgement.prediction["swarmnet thesis-ch5"].fde[-1]
     with pytest.raises(SwarmError, match=r"w_holdout_holdout.h5: does not exist; import with --holdout"):
         learn.run(Learn(data=holdout_path(Path("w.h5"))))
+
+
+@pytest.mark.parametrize(("name", "window"), [("thesis-ch5", 1), ("thesis-ch3", 5)])
+def test_a_probe_of_a_recording(name: str, window: int, here: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    held, drawn = load("w_holdout.h5"), {}
+    assert len(held) == 2
+    assert not held.mask[0, 0].any(), "nobody has a velocity in the first row"
+    monkeypatch.setattr(probe, "DRAWN", 2)
+    figure = probe.contribution_figure
+    monkeypatch.setattr(
+        probe, "contribution_figure", lambda parts, **how: (drawn.update(how, parts=parts), figure(parts, **how))[1]
+    )
+    for old in Path(name).glob("figures/probe-*"):
+        old.unlink()
+    assert probe.run(Probe(run=Path(name), data=Path("w_holdout.h5"))) == 0
+    printed = capsys.readouterr().out
+    assert "no true laws, no linear probe, no figure 5.1: what law made these trajectories is not known" in printed
+    assert "contributions: drawn for the first 2 of the 3 agents of scene 0" in printed
+    assert json.loads((Path(name) / "probe.json").read_text())["scenes"] == 2
+    for what in ("position", "velocity", "contributions"):
+        assert "</svg>" in (Path(name) / "figures" / f"probe-{what}.svg").read_text()
+    assert (drawn["agents"], drawn["first_row"]) == ((0, 1), window - 1)
+    rows = held.mask.shape[1] - window + 1
+    there = np.all([held.mask[0, k : k + rows] for k in range(window)], axis=0)
+    assert set(drawn["parts"]) == {"nothing", "agent"}
+    for part in drawn["parts"].values():
+        np.testing.assert_array_equal(np.isfinite(part).all(axis=-1), there)
+    assert there.any()
+    assert not there.all()
+
+
+def test_what_a_probe_of_a_recording_cannot_draw_is_said(here: Path, capsys):
+    held = load("w_holdout.h5")
+    short = held.mask & (np.arange(held.mask.shape[1]) < 5)[:, None]  # 4 rows with velocities, and the model sees 5
+    save("short.h5", replace(held, mask=short))
+    (Path("thesis-ch3") / "figures" / "probe-contributions.svg").unlink(missing_ok=True)
+    assert probe.run(Probe(run=Path("thesis-ch3"), data=Path("short.h5"))) == 0
+    said = "no contributions: no agent of scene 0 is there for as many rows as the model sees, 5\n"
+    assert said in capsys.readouterr().out
+    assert not (Path("thesis-ch3") / "figures" / "probe-contributions.svg").exists()
+    kind = held.kind.copy()
+    kind[:, 0] = 0
+    save("goals.h5", replace(held, kind=kind))
+    with pytest.raises(SwarmError, match=r"goals\.h5: has up to 1 goals, 0 obstacles and 2 agents, and the model"):
+        probe.run(Probe(run=Path("thesis-ch5"), data=Path("goals.h5")))
+    with pytest.raises(SwarmError, match=r"scenes: 0 was given.*at least 1"):
+        probe.run(Probe(run=Path("thesis-ch5"), data=Path("w_holdout.h5"), scenes=0))
+
+
+def test_a_probe_takes_the_recording_that_a_run_learned_from(here: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    model, named = load_model(Path("thesis-ch5") / "checkpoints"), Probe(run=Path("thesis-ch5"), scenes=1)
+    with pytest.raises(SwarmError, match=r"--data HOLDOUT.h5"):
+        probe.run(named)
+
+    def learned(data: str) -> None:
+        about = model.about | {"data": model.about["data"] | {"learn": {"data": data}}}
+        monkeypatch.setattr(probe, "load_model", lambda folder: replace(model, about=about))
+
+    learned("gone.h5")
+    with pytest.raises(SwarmError, match=r"--data HOLDOUT.h5"):
+        probe.run(named)
+    learned("w.h5")
+    assert probe.run(named) == 0
+    assert "scenes of w.h5, which the model learned from" in capsys.readouterr().out
+    assert json.loads((Path("thesis-ch5") / "probe.json").read_text())["scenes"] == 1
 
 
 def test_predictions_that_scenes_are_too_short_for_are_not_learned():

@@ -26,8 +26,13 @@ from swarmnet.config import Probe
 from swarmnet.figures import STYLE, svg
 from swarmnet.figures_probe import contribution_figure, force_field_figure, separation_figure
 from swarmnet.judge import training_world
+from swarmnet.recorded import check_data
 from swarmnet.results import write_whole
 
+PROBED = 4
+"""Scenes that the linear probe needs: it is fitted to a half and tested on the other."""
+DRAWN = 3
+"""Agents whose contributions are drawn."""
 GOAL = (0.0, 60.0)
 """Where a lone receiver's goal is while other edges are looked at [m]: straight ahead."""
 
@@ -35,8 +40,8 @@ GOAL = (0.0, 60.0)
 @mpl.rc_context(STYLE)
 def run(config: Probe) -> int:
     """Looks inside and prints; RUN gets probe.json and figures/probe-*.svg."""
-    if config.scenes < 4:
-        raise SpecError("scenes", config.scenes, "at least 4")
+    if config.scenes < 1:
+        raise SpecError("scenes", config.scenes, "at least 1")
     model = load_model(config.run / "checkpoints")
     kinds = edge_kinds(model)
     data, expert = _data(config, model)
@@ -53,20 +58,18 @@ def run(config: Probe) -> int:
     for one in found["force_fields"]:
         if one["r2"] is not None:
             print(f"{one['kind']} over relative {one['over']}: R2 {one['r2']:.3f}, error {one['relative_error']:.1%}")
-    if expert is not None and "agent" in kinds and data.counts[2] > 1:
+    if expert is None:
+        print("no true laws, no linear probe, no figure 5.1: what law made these trajectories is not known")
+    elif len(data) < PROBED:
+        print(f"no linear probe: it needs {PROBED} scenes, there are {len(data)}")
+    elif "agent" in kinds and data.counts[2] > 1:
         try:
             probe = linear_probe(model, data, expert, seed=config.seed)
             found["linear_probe"] = {k: getattr(probe, k) for k in ("r2", "shuffled", "fitted", "tested")}
             print(f"messages between agents -> true pair force: R2 {probe.r2:.3f} (shuffled {probe.shuffled:.3f})")
         except LawError as error:
             print(f"no linear probe: {error}")
-    parts = along(model, data, config.scene)
-    agents = np.flatnonzero(data.mask[config.scene, 0, data.kind[config.scene] == AGENT])[:3]
-    if len(agents):
-        shown = contribution_figure(
-            parts, dt=data.dt, agents=tuple(int(a) for a in agents), first_row=model.config.window - 1
-        )
-        _write(config.run, "probe-contributions", shown)
+    _draw_contributions(config, model, data)
     if expert is not None:
         try:
             columns = separation(model, data, expert, walls_stay=config.walls_stay)
@@ -78,7 +81,7 @@ def run(config: Probe) -> int:
                 error = dict(zip(column.error.horizons, column.error.published_mean, strict=True))
                 said = ", ".join(f"{error[h]:.3g} at {h}" for h in HORIZONS if h in error)
                 print(f"figure 5.1 ({name}) {' + '.join(column.kinds)}: normalized error {said} steps")
-            _write(config.run, "figure-5.1", separation_figure(columns))
+            _write(config.run, "figure-5.1", separation_figure(columns, tuple(range(min(2, len(data))))))
         except LawError as error:
             print(f"no figure 5.1: {error}")
     write_whole(config.run / "probe.json", json.dumps(found, indent=1) + "\n")
@@ -87,25 +90,49 @@ def run(config: Probe) -> int:
 
 
 def _data(config: Probe, model: Model) -> tuple[Trajectories, ExpertConfig | None]:
-    """Scenes that the model has not seen, and the law that made them where it is known."""
-    if config.data is None:
+    """Scenes that the model has not seen, or the recording that it learned from or one that is named, and the law that
+    made them where it is known."""
+    path = config.data or _recording(model)
+    if path is None:
         seen = training_world(model)
         if config.seed == seen.seed:
             raise SpecError("seed", config.seed, f"another seed than the training data's, {seen.seed}")
         world = replace(seen, scenes=config.scenes, seed=config.seed)
         return simulate_in_memory(world), world.world().expert
-    data = load(config.data)
-    data = data.take(slice(0, config.scenes))
-    if len(data) < 4:
-        raise SwarmError(f"{config.data}: holds {len(data)} scenes, a probe needs at least 4")
+    data = load(path).take(slice(0, config.scenes))
+    if config.data is None:
+        print(f"scenes of {path}, which the model learned from (--data names others)")
     trained = model.integrator
     if abs(trained.dt - data.dt) > 1e-6 or trained.substeps != data.substeps:
         raise SwarmError(
-            f"{config.data}: has rows {data.dt:g} s apart with {data.substeps} substeps, the model was trained at "
+            f"{path}: has rows {data.dt:g} s apart with {data.substeps} substeps, the model was trained at "
             f"dt {trained.dt:g} s with {trained.substeps}"
         )
+    check_data(model, data, path)
     settings = data.provenance.get("simulate")
     return data, None if settings is None else from_plain(SimulateConfig, settings).world().expert
+
+
+def _recording(model: Model) -> Path | None:
+    """The imported file that a model learned from, where it says so and the file is still there."""
+    named = [Path(about["learn"]["data"]) for about in model.trained_on if "learn" in about and "simulate" not in about]
+    return next((path for path in named if path.exists()), None)
+
+
+def _draw_contributions(config: Probe, model: Model, data: Trajectories) -> None:
+    """Of the first agents that are in the scene at any time, with gaps where they are not."""
+    scene, window = config.scene, model.config.window
+    mask = data.mask[scene][:, data.kind[scene] == AGENT]
+    there = np.lib.stride_tricks.sliding_window_view(mask, window, axis=0).all(axis=-1)  # in all that the model sees
+    agents = tuple(int(agent) for agent in np.flatnonzero(there.any(axis=0)))
+    if not agents:
+        print(f"no contributions: no agent of scene {scene} is there for as many rows as the model sees, {window}")
+        return
+    parts = {kind: np.where(there[..., None], part, np.nan) for kind, part in along(model, data, scene).items()}
+    shown = contribution_figure(parts, dt=data.dt, agents=agents[:DRAWN], first_row=window - 1)
+    _write(config.run, "probe-contributions", shown)
+    if len(agents) > DRAWN:
+        print(f"contributions: drawn for the first {DRAWN} of the {len(agents)} agents of scene {scene}")
 
 
 def _known(model: Model, kind: str, expert: ExpertConfig | None, over: str) -> ForceField:
