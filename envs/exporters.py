@@ -90,7 +90,8 @@ def export(
 def long_table(trajectories: Trajectories) -> pa.Table:
     """A row per scene, time and present node: run, t [s], id (number of the node), type, x, y [m], vx, vy [m/s].
 
-    Read back with `--velocity file` it gives the same states. Units stand in the schema's metadata.
+    Read back with `--velocity file` it gives the same states, without rows at both ends in which nobody is. Units are
+    in the schema's metadata.
     """
     t = trajectories
     run, row, node = (index.astype(np.int32) for index in np.nonzero(t.mask))

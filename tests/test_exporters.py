@@ -16,7 +16,7 @@ from learning import blank
 from envs.exporters import ExportError, export, gns_metadata, long_table, nri_arrays, without_partial
 from envs.importers import ImportConfig, import_files
 from envs.storage import load, save
-from envs.trajectories import AGENT, GOAL, NO_EDGE, OBSTACLE, Trajectories
+from envs.trajectories import AGENT, GOAL, NO_EDGE, OBSTACLE, Trajectories, concatenate
 from swarm_mjcf.errors import SpecError
 from swarmnet.cli import main
 
@@ -108,6 +108,33 @@ def test_long_tables_hold_who_comes_and_goes(tmp_path: Path):
     assert table.column_names == ["run", "t", "id", "type", "x", "y", "vx", "vy"]
     assert table.num_rows == t.mask.sum()
     assert set(table["type"].to_pylist()) == {"goal", "obstacle", "agent"}
+
+
+def there_in(t: Trajectories, rows: list[int]) -> Trajectories:
+    """The same with nobody there in all other rows."""
+    mask = t.mask & np.isin(np.arange(t.mask.shape[1]), rows)[:, None]
+    here = mask[..., None]
+    return replace(t, mask=mask, position=np.where(here, t.position, 0), velocity=np.where(here, t.velocity, 0))
+
+
+@pytest.mark.parametrize("format", ["csv", "parquet"])
+def test_an_import_comes_back_without_the_rows_at_its_ends_in_which_nobody_is(tmp_path: Path, format: str):
+    """An import by differences begins with such a row: nobody has a velocity yet."""
+    walks = [f"{k / 10},{i},{0.3 * k * i},{k**2 / 7}" for i in (1, 2) for k in range(8)]
+    (tmp_path / "w.csv").write_text("t,id,x,y\n" + "\n".join(walks) + "\n")
+    units = {"unit": "m", "time_unit": "s"}
+    whole = imported(tmp_path / "w.csv", segment=0.0, **units)
+    assert whole.position.shape == (1, 8, 2, 2)
+    assert whole.mask[0].any(axis=1).tolist() == [False] + [True] * 7
+    t = concatenate([there_in(whole, [1, 2, 3, 4, 5, 6]), there_in(whole, [2, 3, 4, 6])])
+    (tmp_path / "back").mkdir()
+    export(t, tmp_path / "back" / f"t.{format}", format)
+    declared = units if format == "csv" else {}
+    again = imported(tmp_path / "back" / f"t.{format}", velocity="file", segment=0.0, gap="split", **declared)
+    assert_same_states(again.take([0]), t.take([0]).rows(1, 6))
+    # A scene begins with the first row that somebody is in and has as many rows as the longest.
+    assert again.mask[1].all(axis=1).tolist() == [True, True, True, False, True, False]
+    assert_same_states(again.take([1]), t.take([1]).rows(2, 6))
 
 
 def test_a_row_of_the_long_table():
