@@ -303,6 +303,15 @@ def test_units_in_brackets_are_no_columns(header: str, tmp_path: Path):
     np.testing.assert_array_equal(bracketed.position, plain.position)
 
 
+@pytest.mark.parametrize("name", ["PersID", "pers_id", "PersonID", "ped"])
+def test_columns_of_a_juelich_header_are_found_by_name(name: str, tmp_path: Path):
+    head = f"# framerate: 5\n# framerate: 5.0 fps\n# Frame {name} X/cm Y/m\n# x and y are of the head\n"
+    (track,) = read(text("a.txt", head + "0 7 100 2\n1 7 120 2\n0 8 300 2\n")(tmp_path), PLAIN)
+    assert track.labels == ("7", "8")
+    np.testing.assert_allclose(track.time, [0, 0.2, 0])
+    np.testing.assert_allclose(track.position, [[1, 2], [1.2, 2], [3, 2]])
+
+
 def test_two_files_of_different_declared_units(tmp_path: Path):
     first = juelich(tmp_path / "a.txt", header="# framerate: 5\n# id frame x/cm y/m\n")
     second = jupedsim(tmp_path / "b.sqlite")
@@ -415,7 +424,31 @@ BROKEN = {
         ImportConfig(fps=10.0),
         "says 25 frames per second, --fps says 10",
     ),
-    "juelich no x": (text("a.txt", "# framerate: 25\n# id frame y/m\n1 0 1 1\n"), PLAIN, "header names no column x"),
+    "juelich no x": (
+        text("a.txt", "# framerate: 25\n# id frame y/m\n1 0 1 1\n"),
+        PLAIN,
+        "header names no column for x",
+    ),
+    "juelich an unknown name of ids": (
+        text("a.txt", "# framerate: 25\n# Frame Who X/cm Y/cm\n0 1 1 1\n"),
+        PLAIN,
+        r"header names no column for id \(known are id, persid, pers_id, personid, ped\): Frame Who X/cm Y/cm",
+    ),
+    "juelich unit said twice": (
+        text("a.txt", "# framerate: 25\n# PersID Frame X/cm Y/m\n1 0 1 1\n"),
+        ImportConfig(unit="m"),
+        "its header says cm, --unit says m",
+    ),
+    "juelich two names of ids": (
+        text("a.txt", "# framerate: 25\n# id PersID frame x/m y/m\n1 1 0 1 1\n"),
+        PLAIN,
+        "header names id more than once: id PersID",
+    ),
+    "juelich two rates": (
+        text("a.txt", "# framerate: 25\n# framerate: 30\n# id frame x/m y/m\n1 0 1 1\n"),
+        PLAIN,
+        "its header names several frame rates: 25, 30",
+    ),
     "juelich more names than columns": (
         text("a.txt", "# framerate: 25\n# id frame x/m y/m z/m\n1 0 1 1\n"),
         PLAIN,
