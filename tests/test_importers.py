@@ -913,6 +913,36 @@ def test_many_files_outliers_and_gaps_fit_into_the_header(tmp_path: Path):
     assert "file_54.csv" in card_path(tmp_path / "out.h5").read_text()
 
 
+def test_who_is_left_out_is_said(tmp_path: Path, capsys):
+    """Steps of 0.4 s: a.csv has id 1 for 7 rows and 2 for 2; b.csv has three ids of 2 rows, of which none is left."""
+    short = np.asarray([(f, i, f, 0) for i in range(3) for f in range(2)])
+    first = csv(tmp_path / "a.csv", np.vstack([WALK[:7], WALK[7:9]]))
+    second = csv(tmp_path / "b.csv", short)
+    out = tmp_path / "out.h5"
+    declared = ("--unit", "m", "--time-unit", "s", "--dt", "0.4", "--out", str(out))
+    assert main(("import", str(first), str(second), *declared)) == 0
+    words = "left out: 4 of 5 ids, with too few rows for steps of 0.4 s; 1 of 2 runs, with no agent left (b.csv)\n"
+    assert words in capsys.readouterr().out
+    card = card_path(out).read_text()
+    assert words in card
+    assert "## Runs left out: 1 of 1\n\n- b.csv\n" in card
+    about = read_header(out).provenance["import"]
+    assert about["left_out"] == {"ids": 4, "of_ids": 5, "runs": 1, "of_runs": 2, "listed": ["b.csv"]}
+
+
+def test_rows_of_segments_that_are_cut_away_are_counted(tmp_path: Path, capsys):
+    """Rows 1 to 6 of the grid in segments of 3: row 6 is alone in the third."""
+    path, out = csv(tmp_path / "w.csv", WALK[:7]), tmp_path / "out.h5"
+    declared = ("--unit", "m", "--time-unit", "s", "--out", str(out))
+    assert main(("import", str(path), "--segment", "0.6", *declared)) == 0
+    words = "left out: 1 of 6 rows of agents, in segments that have agents in one row only (everything)\n"
+    assert words in capsys.readouterr().out
+    assert load(out).mask.sum() == 5
+    out.unlink()
+    assert main(("import", str(path), *declared)) == 0
+    assert "eft out" not in capsys.readouterr().out + card_path(out).read_text()
+
+
 def test_coordinates_too_large_for_single_precision_ask_for_an_origin(tmp_path: Path):
     path = csv(tmp_path / "w.csv", np.add(WALK[:7], [0, 0, 5e6, 4e6]))
     with pytest.raises(ImportFailed, match=r"coordinates reach 5e\+06 m.*--origin X Y"):

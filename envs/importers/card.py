@@ -22,12 +22,13 @@ def card(
     sources: Sequence[dict],
     config: ImportConfig,
     dt: float,
+    read: Sequence[Samples],
     runs: Sequence[Samples],
     figures: Survey,
     divided: str,
     command: str,
 ) -> dict:
-    """What holds for the whole import, plain JSON."""
+    """What holds for the whole import, plain JSON. `runs` are those of `read` that have agents."""
     gaps = [gap for run in runs for gap in run.gaps]
     about = {key: value for key, value in asdict(figures).items() if key not in ("outliers", "outlying", "thresholds")}
     return {
@@ -42,6 +43,7 @@ def card(
         "seconds": float(sum((run.rows - 1) * dt for run in runs)),
         "agent_rows": int(sum(run.agents.sum() for run in runs)),
         "figures": about,
+        "left_out": _left_out(read),
         "gaps": {
             "policy": config.gap,
             "count": len(gaps),
@@ -58,12 +60,27 @@ def card(
     }
 
 
+def _left_out(read: Sequence[Samples]) -> dict:
+    """Ids without a row on the grid, and runs without an agent."""
+    of_ids = sum(len(run.tracks.labels) for run in read)
+    lost = [run.tracks.name for run in read if not run.agents.any()]
+    return {
+        "ids": of_ids - sum(len(np.unique(run.person)) for run in read),
+        "of_ids": of_ids,
+        "runs": len(lost),
+        "of_runs": len(read),
+        "listed": lost,
+    }
+
+
 def part(name: str, runs: Sequence[Samples], scenes: Sequence[Scene], rows: int) -> dict:
     """What holds for one file of the import: the training part, the held-out part, or everything."""
     return {
         "part": name,
         "part_runs": len(runs),
         "part_agents": sum(len(np.unique(run.person[run.agents])) for run in runs),
+        "part_agent_rows": int(sum(run.agents.sum() for run in runs)),
+        "rows_in_scenes": int(sum(scene.run.agents[scene.which].sum() for scene in scenes)),
         "scenes": len(scenes),
         "rows_per_scene": rows,
     }
@@ -71,7 +88,7 @@ def part(name: str, runs: Sequence[Samples], scenes: Sequence[Scene], rows: int)
 
 def brief(about: dict) -> dict:
     """The card for the file's provenance: long lists are cut."""
-    short = {what: about[what] | {"listed": about[what]["listed"][:KEPT]} for what in ("gaps", "outliers")}
+    short = {what: about[what] | {"listed": about[what]["listed"][:KEPT]} for what in ("left_out", "gaps", "outliers")}
     return about | short | {"files": about["files"][:KEPT], "number_of_files": len(about["files"])}
 
 
@@ -93,8 +110,9 @@ def echo(about: dict) -> str:
     for source in about["files"]:
         facts.setdefault(tuple(source["facts"].items()), []).append(source["name"])
     for fact, names in facts.items():
-        some = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-        lines.append(f"{some}: " + "; ".join(f"{key}: {value}" for key, value in fact))
+        lines.append(f"{_some(names, len(names))}: " + "; ".join(f"{key}: {value}" for key, value in fact))
+    if lost := _lost(about):
+        lines.append(f"left out: {'; '.join(lost)}")
     gaps, outliers = about["gaps"], about["outliers"]
     if gaps["count"]:
         lines.append(
@@ -105,6 +123,30 @@ def echo(about: dict) -> str:
     lines.append(f"{outliers['count']} outliers ({limits}), kept" + (": see the card" if outliers["count"] else ""))
     lines.append(about["division"])
     return "\n".join(lines)
+
+
+def _lost(about: dict) -> list[str]:
+    """What was left out and why, in words; nothing for cards of before it was counted."""
+    lost, said = about.get("left_out"), []
+    if lost is None:
+        return said
+    if lost["ids"]:
+        said.append(f"{lost['ids']} of {lost['of_ids']} ids, with too few rows for steps of {about['dt']:g} s")
+    if lost["runs"]:
+        said.append(
+            f"{lost['runs']} of {lost['of_runs']} runs, with no agent left ({_some(lost['listed'], lost['runs'])})"
+        )
+    if cut := about["part_agent_rows"] - about["rows_in_scenes"]:
+        said.append(
+            f"{cut} of {about['part_agent_rows']} rows of agents, in segments that have agents in one row only "
+            f"({about['part']})"
+        )
+    return said
+
+
+def _some(names: Sequence[str], count: int, most: int = 3) -> str:
+    """The first of `count` names."""
+    return ", ".join(names[:most]) + (f" and {count - most} more" if count > most else "")
 
 
 def render(about: dict, name: str) -> str:
@@ -132,6 +174,13 @@ def render(about: dict, name: str) -> str:
         "|---|---:|---|",
         *(f"| {file['name']} | {file['bytes']} | {file['sha256']} |" for file in about["files"]),
     ]
+    if lost := about.get("left_out", {}).get("listed"):
+        lines += [
+            "",
+            f"## Runs left out: {len(lost)} of {about['left_out']['runs']}",
+            "",
+            *(f"- {name}" for name in lost),
+        ]
     for what, columns in (
         ("gaps", ("run", "id", "start", "length", "bridged")),
         ("outliers", ("run", "id", "time", "what", "value")),

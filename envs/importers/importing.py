@@ -85,11 +85,11 @@ def import_files(
         tracks += found
         facts.append(found[0].facts)
     dt = time_step(tracks, config)
-    runs = []
+    everything = []
     for number, track in enumerate(tracks):
-        runs.append(sampled(track, dt, config))
+        everything.append(sampled(track, dt, config))
         update(number + 1, len(tracks), "resample")
-    runs = [run for run in runs if run.agents.any()]
+    runs = [run for run in everything if run.agents.any()]
     if not runs:
         raise ImportFailed(f"{tracks[0].name}: no agent has two rows {dt:g} s apart, so there is no velocity")
     figures = survey(runs, dt, config)
@@ -100,6 +100,7 @@ def import_files(
         sources=[source | {"facts": fact} for source, fact in zip(sources, facts, strict=True)],
         config=config,
         dt=dt,
+        read=everything,
         runs=runs,
         figures=figures,
         divided=divided,
