@@ -727,6 +727,31 @@ def test_the_files_own_velocities_are_kept_when_asked_for(tmp_path: Path):
         trajectories(csv(tmp_path / "v.csv"), replace(METRES, velocity="file"))
 
 
+@pytest.mark.parametrize(
+    ("header", "columns", "factor"),
+    [
+        ("x/cm,y/cm,vx/m/s,vy/m/s", (), (1, 1)),
+        ("x/cm,y/cm,vx [m/s],vy (cm/s)", (), (1, 0.01)),
+        ("x/cm,y/cm,u [m / s],vy", ("vx=u",), (1, 0.01)),
+        ("x/m,y/m,vx [cm/s],vy", ("vx=vx [cm/s]",), (0.01, 1)),
+    ],
+)
+def test_velocities_have_their_own_unit_or_that_of_positions(
+    header: str, columns: tuple[str, ...], factor: tuple[float, float], tmp_path: Path
+):
+    path = text("a.csv", f"t/s,id,{header}\n0,1,0,0,3,4\n1,1,1,1,3,4\n")(tmp_path)
+    (track,) = read(path, ImportConfig(velocity="file", columns=columns))
+    np.testing.assert_allclose(track.velocity, [[3 * factor[0], 4 * factor[1]]] * 2)
+
+
+@pytest.mark.parametrize("unit", ["m/min", "px/s", "m", "km/h"])
+def test_other_units_of_velocities_are_refused_where_they_are_used(unit: str, tmp_path: Path):
+    path = text("a.csv", f"t/s,id,x/m,y/m,vx [{unit}],vy\n0,1,0,0,3,4\n1,1,1,1,3,4\n")(tmp_path)
+    with pytest.raises(ImportFailed, match=f"says unit of velocities '{unit}', known are m/s, dm/s"):
+        read(path, ImportConfig(velocity="file"))
+    assert len(read(path, PLAIN)[0].time) == 2
+
+
 # --- scenes, hold-out ---
 
 

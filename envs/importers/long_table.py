@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.importers.config import FIELDS, KINDS, ImportConfig
+from envs.importers.config import FIELDS, KINDS, LENGTHS, ImportConfig
 from envs.importers.tracks import ImportFailed, Tracks, height_fact, length, numbered, seconds, tracks_of, unit_facts
 
-_WITH_UNIT = re.compile(r"^\s*(.+?)\s*(?:/\s*(\w+)|\[\s*(\w+)\s*\]|\(\s*(\w+)\s*\))\s*$")
+_UNIT = r"\s*(\w+(?:\s*/\s*\w+)?)\s*"
+_WITH_UNIT = re.compile(rf"^\s*(.+?)\s*(?:/{_UNIT}|\[{_UNIT}\]|\({_UNIT}\))\s*$")
 TEXT = ("id", "type", "run")
 """Columns that may hold words."""
 
@@ -23,7 +24,7 @@ class Column:
 
 
 def find_columns(path: str, names: Sequence[str], config: ImportConfig) -> dict[str, Column]:
-    """Our column -> where the file has it. Headers may tell units, as in `x/cm`, `x [cm]` or `x (cm)`.
+    """Our column -> where the file has it. Headers may tell units, as in `x/cm`, `x [cm]`, `x (cm)` or `vx [cm/s]`.
 
     Raises ImportFailed for a column that is missing, or is named but not there.
     """
@@ -86,8 +87,11 @@ def runs_of(
         facts["z"] = height_fact(path, values["z"] * scale["z"], values["id"])
     position = np.stack([values["x"] * scale["x"], values["y"] * scale["y"]], axis=1)
     velocity = None
-    if "vx" in columns and "vy" in columns:
-        velocity = np.stack([values["vx"] * scale["x"], values["vy"] * scale["y"]], axis=1)
+    if config.velocity == "file" and "vx" in columns and "vy" in columns:
+        speed = {axis: _speed(path, units[f"v{axis}"]) or scale[axis] for axis in ("x", "y")}
+        velocity = np.stack([values["vx"] * speed["x"], values["vy"] * speed["y"]], axis=1)
+        if told := [f"{unit} ({name})" for name in ("vx", "vy") if (unit := units[name])]:
+            facts["unit of velocities"] = ", ".join(told)
     kind = _kinds(path, values["type"], config) if "type" in columns else None
     if "run" not in columns:
         runs, of_run = ("",), np.zeros(len(values["id"]), np.int64)
@@ -107,6 +111,17 @@ def runs_of(
         )
         for run, rows in zip(runs, np.split(order, ends[:-1]), strict=True)
     ]
+
+
+def _speed(path: str, said: str | None) -> float | None:
+    """m/s in a header's unit of velocities; None where it says none, then they are in the unit of positions, per s."""
+    if said is None:
+        return None
+    unit, _, per = (word.strip() for word in said.partition("/"))
+    if unit not in LENGTHS or per != "s":
+        known = ", ".join(f"{unit}/s" for unit in LENGTHS)
+        raise ImportFailed(f"{path}: its header says unit of velocities '{said}', known are {known}")
+    return LENGTHS[unit]
 
 
 def _kinds(path: str, types: np.ndarray, config: ImportConfig) -> np.ndarray:
