@@ -275,25 +275,54 @@ def test_a_frame_rate_counts_frames_alone(tmp_path: Path):
     np.testing.assert_allclose(track.time, [0, 0.2])
 
 
-@pytest.mark.parametrize("format", ["csv", "juelich", "eth"])
+@pytest.mark.parametrize("format", WRITERS)
 def test_a_third_coordinate_that_varies_is_said_and_one_that_is_no_number_refused(format: str, tmp_path: Path):
-    def written(heights: tuple[str, ...]) -> tuple[Path, ImportConfig]:
-        rows = enumerate(heights)
-        if format == "csv":
-            return text("a.csv", "t,id,x,y,z\n" + "\n".join(f"{k},1,{k},0,{z}" for k, z in rows))(tmp_path), METRES
-        if format == "juelich":
-            head = "# framerate: 5 fps\n# id frame x/m y/m z/m\n"
-            return text("a.txt", head + "\n".join(f"1 {k} {k} 0 {z}" for k, z in rows))(tmp_path), PLAIN
-        lines = "\n".join(f"{k} 1 {k} {z} 0 1 0 0" for k, z in rows)
-        return text("obsmat.txt", lines)(tmp_path), ImportConfig(fps=5.0)
+    def written(heights: tuple[float, ...]) -> tuple[Path, ImportConfig]:
+        _, name, config = WRITERS[format]
+        path, rows = tmp_path / name, [(k, 1, k, 0, z) for k, z in enumerate(heights)]
+        frame, id, x, y, z = np.asarray(rows).T
+        lines = {
+            "csv": ["t,id,x,y,z"] + [f"{k},1,{k},0,{z}" for k, *_, z in rows],
+            "juelich": ["# framerate: 5 fps", "# id frame x/m y/m z/m"] + [f"1 {k} {k} 0 {z}" for k, *_, z in rows],
+            "eth": [f"{k} 1 {k} {z} 0 1 0 0" for k, *_, z in rows],
+            "trajnet": ['{"scene": {"fps": 5}}']
+            + [json.dumps({"track": dict(zip("fpxyz", row, strict=True))}) for row in rows],
+        }
+        path.unlink(missing_ok=True)
+        if format == "parquet":
+            parquet(path, frame=frame, id=id, x=x, y=y, z=z)
+        elif format == "matlab":
+            savemat(path, {"tracks": np.asarray(rows)})
+            config = replace(config, columns=(*config.columns, "z=5"))
+        elif format == "jupedsim":
+            jupedsim(path, np.asarray(rows)[:, :4])
+            with sqlite3.connect(path) as base:
+                base.execute("ALTER TABLE trajectory_data ADD COLUMN pos_z REAL")
+                base.executemany("UPDATE trajectory_data SET pos_z = ? WHERE frame = ?", [(r[4], r[0]) for r in rows])
+            base.close()
+        else:
+            path.write_text("\n".join(lines[format]))
+        return path, config
 
-    (track,) = read(*written(("1.7", "1.75", "1.72")))
+    (track,) = read(*written((1.7, 1.75, 1.72)))
     assert track.facts["z"] == "left out, varies by at most 0.05 m within an id"
-    (track,) = read(*written(("1.7", "2.5", "3.4")))
+    (track,) = read(*written((1.7, 2.5, 3.4)))
     assert "left out although it varies by up to 1.7 m" in track.facts["z"]
     assert track.position.shape == (3, 2)
     with pytest.raises(ImportFailed, match="z is not finite"):
-        read(*written(("1.7", "nan", "3.4")))
+        read(*written((1.7, np.nan, 3.4)))
+
+
+def test_heights_are_compared_within_a_run(tmp_path: Path):
+    path = text("a.csv", "run,t,id,x,y,z\na,0,1,0,0,1.7\na,1,1,1,0,1.8\nb,0,1,0,0,3.0\nb,1,1,1,0,3.0\n")(tmp_path)
+    assert read(path, METRES)[0].facts["z"] == "left out, varies by at most 0.1 m within an id"
+
+
+def test_a_height_that_some_tracks_lack_is_refused(tmp_path: Path):
+    lines = '{"scene": {"fps": 2}}\n{"track": {"f": 0, "p": 1, "x": 0, "y": 0}}\n'
+    path = text("a.ndjson", lines + '{"track": {"f": 1, "p": 1, "x": 0, "y": 0, "z": 1.7}}\n')(tmp_path)
+    with pytest.raises(ImportFailed, match="z is not finite in some rows"):
+        read(path, PLAIN)
 
 
 @pytest.mark.parametrize("header", ["# id frame x [cm] y [m] z [m]", "# id frame x[cm] y(m) z (m)"])

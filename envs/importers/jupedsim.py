@@ -1,4 +1,4 @@
-"""JuPedSim's SQLite: table trajectory_data (frame, id, pos_x, pos_y), table metadata with fps; metres by definition."""
+"""JuPedSim's SQLite: table trajectory_data (frame, id, pos_x, pos_y [, pos_z]), table metadata with fps; in metres."""
 
 import contextlib
 import sqlite3
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.importers.config import ImportConfig
-from envs.importers.tracks import ImportFailed, Tracks, Update, frame_rate, length, readable, tracks_of
+from envs.importers.tracks import ImportFailed, Tracks, Update, frame_rate, height_fact, length, readable, tracks_of
 
 NEEDED = ("frame", "id", "pos_x", "pos_y")
 _PART = 100_000
@@ -33,7 +33,8 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
             (rows,) = base.execute("SELECT count(*) FROM trajectory_data").fetchone()
             if not rows:
                 raise ImportFailed(f"{path}: no rows of data")
-            parts, cursor = [], base.execute("SELECT frame, id, pos_x, pos_y FROM trajectory_data ORDER BY id, frame")
+            wanted = ", ".join((*NEEDED, "pos_z") if "pos_z" in columns else NEEDED)
+            parts, cursor = [], base.execute(f"SELECT {wanted} FROM trajectory_data ORDER BY id, frame")
             while part := cursor.fetchmany(_PART):
                 parts.append(np.asarray(part, np.float64))
                 update(sum(map(len, parts)), rows, f"read {path.name}")
@@ -45,7 +46,9 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
     rate, rate_fact = frame_rate(str(path), config, said, where="metadata")
     scale, unit = length(str(path), config, "m", where="format")
     facts = {"format": "JuPedSim SQLite", "unit": unit, "frame rate": rate_fact}
-    return [tracks_of(path.name, time=table[:, 0] / rate, id=table[:, 1], position=table[:, 2:] * scale, facts=facts)]
+    if "pos_z" in columns:
+        facts["z"] = height_fact(str(path), table[:, 4] * scale, table[:, 1])
+    return [tracks_of(path.name, time=table[:, 0] / rate, id=table[:, 1], position=table[:, 2:4] * scale, facts=facts)]
 
 
 def _said(path: Path, base: sqlite3.Connection) -> float | None:

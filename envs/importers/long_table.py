@@ -83,8 +83,6 @@ def runs_of(
     for axis in ("x", "y", *(("z",) if "z" in columns else ())):
         scale[axis], said[axis] = length(path, config, units[axis])
     facts |= {"times": time_fact, **unit_facts(said)}
-    if "z" in columns:
-        facts["z"] = height_fact(path, values["z"] * scale["z"], values["id"])
     position = np.stack([values["x"] * scale["x"], values["y"] * scale["y"]], axis=1)
     velocity = None
     if config.velocity == "file" and "vx" in columns and "vy" in columns:
@@ -97,6 +95,9 @@ def runs_of(
         runs, of_run = ("",), np.zeros(len(values["id"]), np.int64)
     else:
         runs, of_run = numbered(values["run"])
+    if "z" in columns:
+        _, person = numbered(values["id"])
+        facts["z"] = height_fact(path, values["z"] * scale["z"], person * len(runs) + of_run)
     order = np.argsort(of_run, kind="stable")
     ends = np.cumsum(np.bincount(of_run, minlength=len(runs)))
     return [

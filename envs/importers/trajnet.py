@@ -7,7 +7,7 @@ import numpy as np
 
 from envs.importers.config import ImportConfig
 from envs.importers.text import lines_of
-from envs.importers.tracks import ImportFailed, Tracks, Update, frame_rate, length, tracks_of
+from envs.importers.tracks import ImportFailed, Tracks, Update, frame_rate, height_fact, length, tracks_of
 
 
 def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
@@ -16,9 +16,9 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
     Positions are metres by the format's definition. `fps` counts annotated frames, whose numbers may advance by more
     than 1 (those of the video): the step is the usual one, the median over people's rows.
     """
-    rows: list[tuple[float, float, float, float]] = []
+    rows: list[tuple[float, float, float, float, float]] = []
     rates: set[float] = set()
-    predicted = scenes = 0
+    predicted = scenes = high = 0
     for number, line in enumerate(lines_of(path, update), 1):
         if not line.strip():
             continue
@@ -32,7 +32,8 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
                 if any(track.get(key) is not None for key in ("prediction_number", "pred_number")):
                     predicted += 1
                     continue
-                rows.append((track["f"], track["p"], track["x"], track["y"]))
+                high += "z" in track
+                rows.append((track["f"], track["p"], track["x"], track["y"], track.get("z", np.nan)))
             else:
                 raise KeyError("scene or track")
         except (ValueError, TypeError, KeyError, AttributeError) as error:
@@ -46,7 +47,7 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
     try:
         table = np.asarray(rows, np.float64)
     except (ValueError, TypeError) as error:
-        raise ImportFailed(f"{path}: a track has f, p, x or y that is no number") from error
+        raise ImportFailed(f"{path}: a track has f, p, x, y or z that is no number") from error
     step = _usual_step(table)
     rate, rate_fact = frame_rate(str(path), config, rates.pop() if rates else None, where="scene lines")
     scale, unit = length(str(path), config, "m", where="format")
@@ -57,7 +58,9 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
         "scenes of the file": str(scenes),
         "prediction rows": f"{predicted} left out",
     }
-    position = table[:, 2:] * scale
+    if high:
+        facts["z"] = height_fact(str(path), table[:, 4] * scale, table[:, 1])
+    position = table[:, 2:4] * scale
     return [tracks_of(path.name, time=table[:, 0] / (step * rate), id=table[:, 1], position=position, facts=facts)]
 
 
