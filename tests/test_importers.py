@@ -318,6 +318,56 @@ def test_heights_are_compared_within_a_run(tmp_path: Path):
     assert read(path, METRES)[0].facts["z"] == "left out, varies by at most 0.1 m within an id"
 
 
+def test_the_rate_of_trajnet_scenes_that_say_none_is_declared(tmp_path: Path):
+    lines = '{"scene": {"id": 0}}\n' + "\n".join(
+        f'{{"track": {{"f": {10 * k}, "p": 1, "x": 0, "y": 0}}}}' for k in (0, 1)
+    )
+    path = text("a.ndjson", lines)(tmp_path)
+    (track,) = read(path, ImportConfig(fps=2.5))
+    np.testing.assert_allclose(track.time, [0, 0.4])
+    with pytest.raises(ImportFailed, match="give --fps"):
+        read(path, PLAIN)
+
+
+def test_a_rate_that_contradicts_the_published_times_is_refused(tmp_path: Path):
+    path = published(tmp_path / "a_timeseries.npy")
+    with pytest.raises(
+        ImportFailed, match=r"a_time.npy: rows are 0.3 s apart, --fps says 25 a second; leave --fps out"
+    ):
+        read(path, ImportConfig(fps=25.0))
+    assert len(read(path, ImportConfig(fps=1 / 0.3))) == 2
+    (tmp_path / "a_time.npy").unlink()
+    assert spacing(read(path, ImportConfig(fps=25.0))[0]) == 0.04
+
+
+@pytest.mark.parametrize("format", ["juelich", "jupedsim", "eth", "trajnet"])
+@pytest.mark.parametrize(
+    ("option", "value", "of"),
+    [
+        ("time_unit", "s", "csv, parquet, matlab"),
+        ("columns", ("t=a",), "csv, parquet, matlab"),
+        ("types", ("a=agent",), "csv, parquet, matlab"),
+        ("variable", "a", "matlab"),
+    ],
+)
+def test_options_that_a_format_does_not_read_are_refused(
+    format: str, option: str, value: object, of: str, tmp_path: Path
+):
+    write, name, config = WRITERS[format]
+    config = replace(config, **{option: value})
+    path = write(tmp_path / name)
+    with pytest.raises(SpecError, match=f"{option}.*nothing for {format}: it belongs to {of}"):
+        import_files([path], config, tmp_path / "out.h5")
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_an_option_may_be_for_one_file_of_several(tmp_path: Path):
+    mixed = [csv(tmp_path / "a.csv"), juelich(tmp_path / "b.txt", header="# framerate: 5\n# id frame x/cm y/m\n")]
+    mixed[0].write_text(mixed[0].read_text().replace("x,y", "x/m,y/m"))
+    import_files(mixed, ImportConfig(time_unit="s"), tmp_path / "out.h5")
+    assert len(load(tmp_path / "out.h5")) == 2
+
+
 def test_a_height_that_some_tracks_lack_is_refused(tmp_path: Path):
     lines = '{"scene": {"fps": 2}}\n{"track": {"f": 0, "p": 1, "x": 0, "y": 0}}\n'
     path = text("a.ndjson", lines + '{"track": {"f": 1, "p": 1, "x": 0, "y": 0, "z": 1.7}}\n')(tmp_path)
@@ -518,7 +568,7 @@ BROKEN = {
     "juelich garbage": (text("a.txt", b"\xff\xfe\x00garbage\n\x80"), PLAIN, "a.txt: is not text"),
     "eth no rate": (text("obsmat.txt", "0 1 1 0 1 0 0 0\n"), PLAIN, "give --fps"),
     "eth columns": (text("obsmat.txt", "0 1 1 0\n"), ImportConfig(fps=15.0), "rows have 4 columns, expected are the 8"),
-    "trajnet no json": (text("a.ndjson", "{]\n"), PLAIN, "line 1 is neither a scene with its fps nor a track"),
+    "trajnet no json": (text("a.ndjson", "{]\n"), PLAIN, "line 1 is neither a scene nor a track"),
     "trajnet no rate": (
         text("a.ndjson", '{"track": {"f": 0, "p": 1, "x": 0, "y": 0}}\n'),
         PLAIN,

@@ -12,7 +12,7 @@ import numpy as np
 from envs.importers import card
 from envs.importers.config import ImportConfig
 from envs.importers.holdout import held_out
-from envs.importers.registry import read
+from envs.importers.registry import check_options, read
 from envs.importers.samples import sampled, time_step
 from envs.importers.scenes import assembled, cut, rows_per_scene
 from envs.importers.survey import Survey, survey
@@ -71,6 +71,7 @@ def import_files(
     if not files:
         raise ImportFailed("no files to import")
     sources = [_source(path) for path in files]
+    check_options(files, config)
     outs = [out, *([holdout_path(out)] if config.holdout else [])]
     mark = fingerprint(sources, config)
     have = [_existing(path, mark) for path in outs]

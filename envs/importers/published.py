@@ -86,7 +86,8 @@ def _graph(path: Path, run: int, edges: np.ndarray, states: np.ndarray) -> tuple
 
 
 def _times(path: Path, config: ImportConfig, runs: int, rows: int) -> tuple[np.ndarray, str]:
-    """Times (runs, rows) [s] from the file, or from --fps or --dt where there is none."""
+    """Times (runs, rows) [s] from the file, or from --fps or --dt where there is none. Raises ImportFailed where file
+    and --fps disagree."""
     if not path.exists():
         step = 1 / config.fps if config.fps is not None else config.dt
         if step is None:
@@ -95,6 +96,12 @@ def _times(path: Path, config: ImportConfig, runs: int, rows: int) -> tuple[np.n
     times = _array(path, 2, f"(runs, rows) = {(runs, rows)}").astype(np.float64)
     if times.shape != (runs, rows):
         raise ImportFailed(f"{path}: has the shape {times.shape}, the time series ask for {(runs, rows)}")
+    steps = np.diff(times, axis=1)
+    if config.fps is not None and steps.size and not np.isclose(np.median(steps), 1 / config.fps, rtol=1e-3):
+        raise ImportFailed(
+            f"{path}: rows are {np.median(steps):.4g} s apart, --fps says {config.fps:g} a second; leave --fps "
+            "out, --dt resamples"
+        )
     return times, "s (time file)"
 
 

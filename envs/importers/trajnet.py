@@ -26,7 +26,8 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
             entry = json.loads(line)
             if "scene" in entry:
                 scenes += 1
-                rates.add(float(entry["scene"]["fps"]))
+                if (rate := entry["scene"].get("fps")) is not None:
+                    rates.add(float(rate))
             elif "track" in entry:
                 track = entry["track"]
                 if any(track.get(key) is not None for key in ("prediction_number", "pred_number")):
@@ -38,7 +39,7 @@ def read(path: Path, config: ImportConfig, update: Update) -> list[Tracks]:
                 raise KeyError("scene or track")
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise ImportFailed(
-                f"{path}: line {number} is neither a scene with its fps nor a track with f, p, x and y ({error})"
+                f"{path}: line {number} is neither a scene nor a track with f, p, x and y ({error})"
             ) from error
     if len(rates) > 1:
         raise ImportFailed(f"{path}: its scenes name several frame rates: {', '.join(f'{r:g}' for r in sorted(rates))}")
