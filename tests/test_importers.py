@@ -496,6 +496,16 @@ BROKEN = {
         "id 1 is agent and goal, a type must stay the same",
     ),
     "parquet garbage": (text("a.parquet", b"PAR1 and nothing"), METRES, "a.parquet: is no whole Parquet file"),
+    "parquet other columns": (
+        lambda d: parquet(d / "a.parquet", time=[0.0], x=[1.0], y=[2.0]),
+        METRES,
+        r"no column t \(or frame\), id among 'time', 'x', 'y'; say which is which, such as --columns t=time",
+    ),
+    "parquet mapped to nothing": (
+        lambda d: parquet(d / "a.parquet", t=[0.0], id=[1], x=[1.0], y=[2.0]),
+        replace(METRES, columns=("id=ped",)),
+        "has no column 'ped'; it has 't', 'id', 'x', 'y'",
+    ),
     "juelich no rate": (text("a.txt", "# id frame x/m y/m z/m\n1 0 1 1 1\n"), PLAIN, "frames a second has; give --fps"),
     "juelich no units": (text("a.txt", "# framerate: 25\n1 0 1 1 1\n"), PLAIN, "unit of positions; give --unit"),
     "juelich rate said twice": (
@@ -637,6 +647,45 @@ def test_large_ids_stay_apart(tmp_path: Path):
     for write, name, config in WRITERS.values():
         (found,) = read(write(tmp_path / name, rows), config)
         assert found.labels == ("20240001", "20240002", "20240003"), name
+
+
+def test_published_arrays_that_are_missing_empty_or_in_space(tmp_path: Path):
+    path = published(tmp_path / "a_timeseries.npy")
+    states, edges = np.load(path), tmp_path / "a_edge.npy"
+    np.save(path, np.concatenate([states, states[..., :2]], axis=-1))
+    with pytest.raises(ImportFailed, match=r"a_timeseries.npy: nodes have 6 numbers, expected are 4: x, y, vx, vy"):
+        read(path, PLAIN)
+    path.write_bytes(b"")
+    with pytest.raises(ImportFailed, match=r"a_timeseries.npy: is empty"):
+        read(path, PLAIN)
+    np.save(path, states)
+    edges.write_bytes(b"")
+    with pytest.raises(ImportFailed, match=r"a_edge.npy: is empty"):
+        read(path, PLAIN)
+    edges.unlink()
+    with pytest.raises(ImportFailed, match=r"a_edge.npy: does not exist"):
+        read(path, PLAIN)
+
+
+def test_published_arrays_of_one_agent(tmp_path: Path):
+    path = published(tmp_path / "a_timeseries.npy")
+    states = np.load(path)[:, :, 2:3]
+    np.save(path, states)
+    np.save(tmp_path / "a_edge.npy", np.zeros((2, 1, 1), int))
+    t = trajectories(path, PLAIN)
+    assert t.counts == (0, 0, 1)
+    assert t.mask.all()
+    assert not t.edges.any()
+    np.testing.assert_array_equal(np.concatenate([t.position, t.velocity], -1), states)
+
+
+@pytest.mark.parametrize("format", ["jupedsim", "eth", "trajnet", "published"])
+def test_a_unit_that_contradicts_the_format_is_refused(format: str, tmp_path: Path):
+    write, name, config = WRITERS.get(format, (published, "a_timeseries.npy", PLAIN))
+    path = write(tmp_path / name)
+    with pytest.raises(ImportFailed, match=f"{name}: its format says m, --unit says cm"):
+        read(path, replace(config, unit="cm"))
+    assert read(path, replace(config, unit="m"))[0].facts["unit"] == "m (format)"
 
 
 def test_broken_published_arrays(tmp_path: Path):
