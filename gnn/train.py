@@ -22,7 +22,7 @@ from envs.plain import plain
 from envs.record import Array
 from envs.trajectories import Trajectories
 from gnn.checkpoint import CheckpointError, Checkpoints, Model, describe
-from gnn.config import AnyModelConfig, ModelConfig, TrainConfig, model_preset
+from gnn.config import AnyModelConfig, TrainConfig, model_preset
 from gnn.decode import Integrator
 from gnn.evaluate import natural_change
 from gnn.family import Family, Params
@@ -61,8 +61,8 @@ def train(
     paths of the weights (`edge/*`); what they match stays as it is (`gnn.freeze`).
 
     Raises TrajectoryError for trajectories too short, SpecError for an initial model of another kind and for patterns
-    that match nothing, SwarmError for an initial model of another dt (or substeps, if it predicts accelerations),
-    CheckpointError for a folder of other settings or data, TrainError when the loss diverges.
+    that match nothing, SwarmError for an initial model of another dt, CheckpointError for a folder of other settings or
+    data, TrainError when the loss diverges.
     """
     prepared = prepare(config, trajectories, validation=validation, initial=initial, freeze=freeze)
     return train_prepared(prepared, folder, progress=progress)
@@ -248,14 +248,12 @@ def fingerprint(params: Params) -> str:
 
 
 def _check_step(initial: Model, trajectories: Trajectories) -> None:
-    """Raises SwarmError unless the data have the control step that the weights were learned for."""
-    had, config = initial.integrator, initial.config
-    # Only an acceleration becomes a state by way of the substeps.
-    substeps = isinstance(config, ModelConfig) and config.output == "acceleration"
-    if abs(had.dt - trajectories.dt) > 1e-6 or (substeps and had.substeps != trajectories.substeps):
+    """Raises SwarmError unless the data have the control step that the weights were learned for. Substeps may differ:
+    the integrator, which is the data's, turns an acceleration into what they make of it."""
+    if abs(initial.integrator.dt - trajectories.dt) > 1e-6:
         raise SwarmError(
-            f"the initial model was trained at dt {had.dt:g} s with {had.substeps} substeps, the data have rows "
-            f"{trajectories.dt:g} s apart with {trajectories.substeps}; tuning needs data like those"
+            f"the initial model was trained at dt {initial.integrator.dt:g} s, the data have rows "
+            f"{trajectories.dt:g} s apart; tuning needs the same"
         )
 
 

@@ -110,11 +110,8 @@ def test_parts_can_be_locked_as_they_were_drawn(tmp_path: Path, first: Model):
 def test_what_does_not_fit_is_refused(tmp_path: Path, first: Model):
     with pytest.raises(SpecError, match="thesis-ch5"):
         train(replace(SHORT, model="best"), spring(), tmp_path / "run", initial=first)
-    said = r"trained at dt 0\.1 s with 1 substeps, the data have rows 0\.2 s apart with 1; tuning needs data like"
-    with pytest.raises(SwarmError, match=said):
+    with pytest.raises(SwarmError, match=r"trained at dt 0\.1 s, the data have rows 0\.2 s apart; tuning"):
         train(SHORT, replace(spring(), dt=0.2), tmp_path / "run", initial=first)
-    with pytest.raises(SwarmError, match=r"rows 0\.1 s apart with 4"):
-        train(SHORT, replace(spring(), substeps=4), tmp_path / "run", initial=first)
     lacking = replace(first, params={name: part for name, part in first.params.items() if name != "edge"})
     with pytest.raises(SpecError, match="edge/goal/layer0/kernel"):
         train(SHORT, spring(), tmp_path / "run", initial=lacking)
@@ -123,10 +120,5 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, first: Model):
     assert not (tmp_path / "run").exists()
 
 
-def test_changes_of_state_are_tuned_on_any_substeps_but_on_no_other_dt():
-    config, data = replace(SHORT, model="thesis-ch3"), spring()
-    beginning = prepare(config, data)
-    first = Model(beginning.preset, beginning.scales, beginning.integrator, beginning.start()["params"], {})
-    assert prepare(config, replace(data, substeps=4), initial=first).integrator.substeps == 4
-    with pytest.raises(SwarmError, match=r"rows 0\.2 s apart"):
-        prepare(config, replace(data, dt=0.2), initial=first)
+def test_tuning_takes_the_substeps_of_its_data(first: Model):
+    assert prepare(SHORT, replace(spring(), substeps=4), initial=first).integrator.substeps == 4

@@ -391,6 +391,12 @@ def test_columns_of_a_juelich_header_are_found_by_name(name: str, tmp_path: Path
     np.testing.assert_allclose(track.position, [[1, 2], [1.2, 2], [3, 2]])
 
 
+def test_prose_about_x_and_y_is_no_juelich_header(tmp_path: Path):
+    head = "# framerate: 5\n# x and y are those of the head\n"
+    (track,) = read(text("a.txt", head + "7 0 1 2\n7 1 2 2\n")(tmp_path), METRES)
+    assert track.labels == ("7",)
+
+
 def test_two_files_of_different_declared_units(tmp_path: Path):
     first = juelich(tmp_path / "a.txt", header="# framerate: 5\n# id frame x/cm y/m\n")
     second = jupedsim(tmp_path / "b.sqlite")

@@ -74,7 +74,8 @@ def _columns(path: Path, comments: list[str], width: int) -> tuple[dict[str, int
                 {name: at for at, name in enumerate(names) if name},
                 {name: unit.lower() for name, (_, _, unit) in zip(names, words, strict=True) if name and unit},
             )
-        if {"x", "y"} <= set(names) or ("id" in names and {"x", "frame"} & set(names)):
+        header = len(names) == width and {"x", "y"} <= set(names)  # or prose about x and y
+        if header or ("id" in names and {"x", "frame"} & set(names)):
             partial = partial or (comment.strip(), [name for name in _NEEDED if name not in names])
     if partial:  # the usual order would be a guess
         known = ", ".join(f"{name} (known are {', '.join(_NAMES[name])})" for name in partial[1])
