@@ -6,13 +6,17 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from envs.trajectories import versions
 from swarm_mjcf.errors import SwarmError
 from swarm_mjcf.whole import WholeFile
+
+UNEVEN = 2
+"""Factor between the gradient steps of a row's seeds above which equal minutes were not equal work, and are marked."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,7 @@ def render_page(folder: str | Path) -> str:
         columns = list(dict.fromkeys(row["column"] for row in document["rows"]))
         names = list(dict.fromkeys(row["row"] for row in document["rows"]))
         cells = {(row["row"], row["column"]): row for row in document["rows"]}
+        most = max((row.get("n", 1) for row in document["rows"]), default=1)
         lines += [
             "",
             f"## {document['name']}",
@@ -148,14 +153,52 @@ def render_page(folder: str | Path) -> str:
             f"{machine['cores']} cores, {', '.join(machine['devices'])}, mujoco {used['mujoco']}, jax {used['jax']}"
             + (f", dt {document['dt']} s" if document["dt"] else "")
             + (f", seeds {', '.join(map(str, document['seeds']))}" if document["seeds"] else ""),
-            *(f"\n{text}" for text in _remarks(document)),
+            *(f"\n{text}" for text in [*_effort(document["rows"]), *_remarks(document)]),
             "",
             "| | " + " | ".join(names) + " |",
             "|---|" + "---:|" * len(names),
         ]
         for column in columns:
-            lines.append(f"| {column} | " + " | ".join(_cell(cells.get((name, column))) for name in names) + " |")
+            lines.append(f"| {column} | " + " | ".join(_cell(cells.get((name, column)), most) for name in names) + " |")
+        lines += [f"\n{text}" for text in uneven(document["rows"])]
     return "\n".join(lines) + "\n"
+
+
+def _effort(rows: Sequence[Mapping]) -> list[str]:
+    """What a cell of `swarmnet reproduce` had and took, from the least to the most of the rows."""
+
+    def had(name: str, form: str) -> str:
+        return span([row[name] for row in rows if row.get(name) is not None], form)
+
+    demonstrations, minutes, seconds = had("demonstrations", "d"), had("minutes", "g"), had("wall_seconds", ".0f")
+    # Where no gradient steps are counted, the minutes are the profile's, and the notes say what became of them.
+    trained = any(row.get("steps") for row in rows)
+    parts = [
+        demonstrations and f"{demonstrations} demonstrations",
+        minutes and (f"{minutes} min of training" if trained else f"a budget of {minutes} min"),
+        seconds and f"{seconds} s a cell",
+    ]
+    return [", ".join(filter(None, parts))] if any(parts) else []
+
+
+def span(values: Sequence[float | int], form: str = "d") -> str:
+    """`3`, `3 to 7`, or nothing of nothing."""
+    return " to ".join(dict.fromkeys(f"{end:{form}}" for end in (min(values), max(values)))) if values else ""
+
+
+def uneven(rows: Sequence[Mapping]) -> list[str]:
+    """A line for the rows whose seeds made numbers of gradient steps more than `UNEVEN` times apart, if any."""
+    columns: dict[tuple, list[str]] = {}
+    for row in rows:
+        steps = row.get("steps", [])
+        if steps and max(steps) > UNEVEN * min(steps):
+            columns.setdefault((row["row"], tuple(steps)), []).append(row["column"])
+    all_of = Counter(row["row"] for row in rows)
+    found = [
+        row + ("" if len(of) == all_of[row] else f" / {', '.join(of)}") + f": {span(steps)} gradient steps"
+        for (row, steps), of in columns.items()
+    ]
+    return ["uneven: " + "; ".join(found)] if found else []
 
 
 def _remarks(document: dict) -> list[str]:
@@ -179,10 +222,12 @@ def unfinished(document: Mapping) -> list[str]:
     return lines + [f"failed: {one['row']}, {one['data']}, seed {one['seed']}: {one['reason']}" for one in failed]
 
 
-def _cell(row: dict | None) -> str:
+def _cell(row: dict | None, most: int) -> str:
+    """Of `most` seeds nothing is said, of fewer how many they are."""
     if row is None or row["value"] is None:
         return ""
     text = f"{row['value']:.4g}" + (f" ± {row['std']:.2g}" if row["std"] is not None else "")
+    text += f" (n = {row['n']})" if row.get("n", most) < most else ""
     return text + (f" (thesis {row['reference']:.4g})" if row["reference"] is not None else "")
 
 

@@ -29,7 +29,7 @@ from swarmnet.reproduce.lock import Busy, locked
 from swarmnet.reproduce.merge import merge, table
 from swarmnet.reproduce.table_3_1 import TABLE_3_1
 from swarmnet.reproduce.table_4_1 import TABLE_4_1
-from swarmnet.results import render_page, write_results
+from swarmnet.results import Results, Row, render_page, write_results
 
 EFFORT = Effort(profile="cpu", demonstrations=10, test_scenes=4, minutes=1.0, data=Path("unused"))
 
@@ -302,6 +302,78 @@ def test_a_smoke_run_and_missing_cells_show_on_the_page(fake: Fake, tmp_path: Pa
     assert "**Smoke run (profile `quick`), not to be quoted.**" in page
     assert "5 missing cells (seeds): best: two (0); rival: one (0), two (0); nothing: one (0), two (0)" in page
     assert "| one 5 | 0 (thesis 0.25) |" in page
+
+
+def judged(row: str, column: str = "a", **more) -> dict:
+    """A row of a document as `swarmnet reproduce` writes it."""
+    usual = {"demonstrations": 5000, "minutes": 2.0, "wall_seconds": 137.4, "n": 3, "steps": [900, 800, 700]}
+    return {"row": row, "column": column, "value": 1.5, "std": 0.25, "reference": None} | usual | more
+
+
+def rendered(folder: Path, rows: list[dict]) -> list[str]:
+    """Lines of the page of one document that was made by hand."""
+    about = {
+        "name": "made",
+        "command": "swarmnet reproduce made",
+        "commit": "c",
+        "date": "2026-01-01",
+        "profile": "cpu",
+    }
+    machine = {"hardware": {"cpu": "x", "cores": 1, "devices": ["cpu"]}, "versions": {"mujoco": "3", "jax": "0"}}
+    folder.mkdir(parents=True)
+    (folder / "made.json").write_text(json.dumps(about | machine | {"dt": 0.3, "seeds": [0], "rows": rows}))
+    return render_page(folder).splitlines()
+
+
+def test_the_page_says_what_cells_had_and_took(tmp_path: Path):
+    assert "5000 demonstrations, 2 min of training, 137 s a cell" in rendered(tmp_path / "a", [judged("x")])
+    untrained = judged("nothing", demonstrations=None, minutes=None, steps=[], wall_seconds=1.0)
+    more = judged("y", demonstrations=20000, minutes=2.5, wall_seconds=1261.5)
+    lines = rendered(tmp_path / "b", [judged("x"), more, untrained])
+    assert "5000 to 20000 demonstrations, 2 to 2.5 min of training, 1 to 1262 s a cell" in lines
+    lines = rendered(tmp_path / "c", [judged("x", steps=[])])
+    assert "5000 demonstrations, a budget of 2 min, 137 s a cell" in lines
+    bench = {"row": "x", "column": "a", "value": 1.5, "std": None, "reference": None}
+    assert not any("a cell" in line for line in rendered(tmp_path / "d", [bench]))
+
+
+def test_the_page_marks_figures_of_fewer_seeds_than_others(tmp_path: Path):
+    rows = [judged("x"), judged("y", n=1, std=None, reference=0.5), judged("z", n=2)]
+    assert "| a | 1.5 ± 0.25 | 1.5 (n = 1) (thesis 0.5) | 1.5 ± 0.25 (n = 2) |" in rendered(tmp_path / "a", rows)
+    assert "| a | 1.5 |" in rendered(tmp_path / "b", [judged("x", n=1, std=None)])
+
+
+def test_the_page_marks_uneven_work(tmp_path: Path):
+    """More than a factor of 2 between seeds: 800 and 7100 are, 700 and 1400 are not."""
+    rows = [
+        judged("x", "a", steps=[800, 900, 7100]),
+        judged("x", "b", steps=[800, 900, 7100]),
+        judged("y", "a", steps=[700, 1400]),
+        judged("y", "b", steps=[700, 1401]),
+        judged("z", "a", steps=[]),
+    ]
+    assert rendered(tmp_path / "a", rows)[-2:] == [
+        "",
+        "uneven: x: 800 to 7100 gradient steps; y / b: 700 to 1401 gradient steps",
+    ]
+    assert not any("uneven" in line for line in rendered(tmp_path / "b", rows[2:3]))
+
+
+def test_the_terminal_says_what_cells_had_and_marks_uneven_work():
+    more = {"n": 3, "dt": 0.3, "demonstrations": 5000, "minutes": 2.0, "wall_seconds": 137.4}
+    untrained = more | {"demonstrations": None, "minutes": None, "steps": []}
+    rows = [
+        Row("x", "a", 1.5, more=more | {"steps": [800, 7100]}),
+        Row("y", "a", 1.5, more=more | {"steps": [700]}),
+        Row("z", "a", 1.5, more=untrained),
+    ]
+    printed = table(Results(name="made", rows=rows, profile="cpu"))
+    head, *lines = [line.split() for line in printed.splitlines()[1:5]]
+    assert head == ["ours", "n", "thesis", "demos", "min", "wall", "s", "steps"]
+    assert lines[0] == ["x", "1.5", "3", "5000", "2", "137", "800", "to", "7100"]
+    assert lines[1] == ["y", "1.5", "3", "5000", "2", "137", "700"]
+    assert lines[2] == ["z", "1.5", "3", "137"]
+    assert printed.splitlines()[-1] == "uneven: x: 800 to 7100 gradient steps"
 
 
 def test_a_figure_is_drawn_from_finished_cells(fake: Fake, tmp_path: Path, monkeypatch, capsys):

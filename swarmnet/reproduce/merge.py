@@ -8,7 +8,7 @@ from pathlib import Path
 from swarmnet.reproduce.cells import records
 from swarmnet.reproduce.elsewhere import carried
 from swarmnet.reproduce.experiment import Cell, Experiment
-from swarmnet.results import Results, Row, unfinished
+from swarmnet.results import Results, Row, span, uneven, unfinished
 
 
 def merge(experiment: Experiment, planned: Sequence[Cell], folder: Path, *, profile: str, command: str) -> Results:
@@ -101,8 +101,12 @@ def table(results: Results) -> str:
     for column in dict.fromkeys(row.column for row in results.rows):
         rows = [row for row in results.rows if row.column == column]
         lines += ["", f"{column}  [{rows[0].unit}, dt {rows[0].more['dt']:g} s]"]
-        lines.append(f"  {'':{width}}  {'ours':>22}  {'n':>2}  {'thesis':>9}  {'min':>5}  {'wall s':>7}")
+        lines.append(
+            f"  {'':{width}}  {'ours':>22}  {'n':>2}  {'thesis':>9}  {'demos':>6}  {'min':>5}  {'wall s':>7}  "
+            f"{'steps':>16}"
+        )
         lines += [f"  {row.row:{width}}  {_figures(row)}" for row in rows]
+    lines += [f"\n{text}" for text in uneven([asdict(row) | row.more for row in results.rows])]
     if machine:
         origin = results.more
         lines += ["", f"{machine['cpu']}, {machine['cores']} cores, {', '.join(machine['devices'])}"
@@ -118,4 +122,9 @@ def _figures(row: Row) -> str:
     ours += "" if row.std is None else f" ± {row.std:.2g}"
     thesis = "" if row.reference is None else f"{row.reference:.4g}"
     minutes = "" if row.more["minutes"] is None else f"{row.more['minutes']:.3g}"
-    return f"{ours:>22}  {row.more['n']:>2}  {thesis:>9}  {minutes:>5}  {row.more['wall_seconds']:>7.0f}"
+    demonstrations = "" if row.more["demonstrations"] is None else row.more["demonstrations"]
+    steps = span(row.more["steps"])
+    return (
+        f"{ours:>22}  {row.more['n']:>2}  {thesis:>9}  {demonstrations:>6}  {minutes:>5}  "
+        f"{row.more['wall_seconds']:>7.0f}  {steps:>16}"
+    )
