@@ -138,7 +138,9 @@ def render_page(folder: str | Path) -> str:
         "",
         "Rendered from `docs/results/*.json` by `make docs`; every file was written by the command it names.",
     ]
-    for path in sorted(Path(folder).glob("[!.]*.json")):
+    paths = sorted(Path(folder).glob("[!.]*.json"))
+    pictures = _pictures(Path(folder).parent / "media", [path.stem for path in paths])
+    for path in paths:
         document = json.loads(path.read_text())
         machine, used = document["hardware"], document["versions"]
         columns = list(dict.fromkeys(row["column"] for row in document["rows"]))
@@ -161,7 +163,18 @@ def render_page(folder: str | Path) -> str:
         for column in columns:
             lines.append(f"| {column} | " + " | ".join(_cell(cells.get((name, column)), most) for name in names) + " |")
         lines += [f"\n{text}" for text in uneven(document["rows"])]
+        lines += [f"\n![{name}](media/{name}.png)" for name in pictures[path.stem]]
     return "\n".join(lines) + "\n"
+
+
+def _pictures(folder: Path, names: Sequence[str]) -> dict[str, list[str]]:
+    """Of each document the pictures NAME.png and NAME-*.png; one that fits several is the longest name's."""
+    found: dict[str, list[str]] = {name: [] for name in names}
+    for picture in sorted(path.stem for path in folder.glob("*.png")):
+        fitting = [name for name in names if picture == name or picture.startswith(f"{name}-")]
+        if fitting:
+            found[max(fitting, key=len)].append(picture)
+    return found
 
 
 def _effort(rows: Sequence[Mapping]) -> list[str]:

@@ -359,6 +359,22 @@ def test_the_page_marks_uneven_work(tmp_path: Path):
     assert not any("uneven" in line for line in rendered(tmp_path / "b", rows[2:3]))
 
 
+def test_the_page_shows_the_pictures_of_a_document(tmp_path: Path):
+    """Its own and its variants, but not those of a document with a longer name, nor others'."""
+    (tmp_path / "media").mkdir()
+    for name in ("made", "made-best", "made-20-minutes", "made-20-minutes-x", "made2", "other"):
+        (tmp_path / "media" / f"{name}.png").touch()
+    rendered(tmp_path / "results", [judged("x")])
+    (tmp_path / "results" / "made-20-minutes.json").write_text((tmp_path / "results" / "made.json").read_text())
+    page = render_page(tmp_path / "results").split("\n## ")
+    shown = [[line for line in part.splitlines() if line.startswith("!")] for part in page]
+    assert shown == [
+        [],
+        ["![made-20-minutes](media/made-20-minutes.png)", "![made-20-minutes-x](media/made-20-minutes-x.png)"],
+        ["![made](media/made.png)", "![made-best](media/made-best.png)"],
+    ]
+
+
 def test_the_terminal_says_what_cells_had_and_marks_uneven_work():
     more = {"n": 3, "dt": 0.3, "demonstrations": 5000, "minutes": 2.0, "wall_seconds": 137.4}
     untrained = more | {"demonstrations": None, "minutes": None, "steps": []}
