@@ -21,6 +21,8 @@ def test_the_guides_code_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     assert "(64, 21, 5, 2)" in capsys.readouterr().out
     assert (tmp_path / "scene.xml").exists()
     assert scope["recording"].position.shape == (64, 21, 5, 2)
+    assert scope["scores"].nll.shape == (5,)
+    assert all(0 < share < 1 for share in scope["scores"].coverage_90)
 
 
 def test_the_code_of_the_interfaces_page_runs(capsys: pytest.CaptureFixture) -> None:
