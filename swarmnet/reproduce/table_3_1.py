@@ -5,8 +5,9 @@ from pathlib import Path
 from envs.config import SimulateConfig
 from gnn.evaluate import constant_velocity, persistence
 from swarmnet.progress import Update
+from swarmnet.reproduce.borrow import Learning, trained_once
 from swarmnet.reproduce.experiment import Cell, DataSet, Effort, Experiment
-from swarmnet.reproduce.work import SLOWLY, demonstrations, errors, published_mean, trained, unseen
+from swarmnet.reproduce.work import SLOWLY, demonstrations, errors, published_mean, unseen
 
 MODELS = {
     "swarmnet best": "best",
@@ -50,8 +51,8 @@ def run(cell: Cell, effort: Effort, folder: Path, progress: Update) -> dict[str,
             column: published_mean(predict, {}, test, window=1, horizon=horizon)
             for column, horizon in zip(columns(cell.data), HORIZONS, strict=True)
         }
-    data = demonstrations(world, effort, cell.seed)
-    model = trained(MODELS[cell.row], data, effort, folder, progress, seed=cell.seed)
+    learning = Learning(model=MODELS[cell.row], seed=cell.seed)
+    model = trained_once(learning, demonstrations(world, effort, cell.seed), effort, folder, progress)
     return errors(model, unseen(world, effort), HORIZONS, columns(cell.data))
 
 
