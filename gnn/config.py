@@ -31,6 +31,8 @@ class ModelConfig:
     """Whether inputs and outputs are scaled by statistics of the training data, stored with the weights."""
     edge_hidden: tuple[int, ...] = (64, 64)
     """Hidden ReLU layers of each edge function; a linear layer `message` wide follows."""
+    edge_bias: bool = True
+    """Whether the layers of edge functions have biases."""
     message: int = 64
     """Width of a message."""
     aggregate: tuple[Literal["sum", "near", "mean", "max"], ...] = ("sum",)
@@ -90,6 +92,14 @@ PRESETS: dict[str, ModelConfig] = {
     "best-mean": replace(_BEST, aggregate=("mean",)),
     "best-max": replace(_BEST, aggregate=("max",)),
     "best-all": replace(_BEST, aggregate=("sum", "mean", "max")),
+    # What separates the edge functions (section 5.6.2): from both ends, one thing changed.
+    "best-world": replace(_BEST, frame=False),
+    "best-narrow": replace(_BEST, message=2),
+    "best-unbiased": replace(_BEST, edge_bias=False),
+    "thesis-ch5-frame": ModelConfig(normalise=True, frame=True),
+    "thesis-ch5-mean": ModelConfig(normalise=True, aggregate=("mean",)),
+    "thesis-ch5-narrow": ModelConfig(normalise=True, message=2),
+    "thesis-ch5-unbiased": ModelConfig(normalise=True, edge_bias=False),
 }
 
 

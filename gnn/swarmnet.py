@@ -53,17 +53,18 @@ class MLP(nn.Module):
     skip: bool = False
     dropout: float = 0.0
     """Of hidden neurons; only where the caller gives a random stream of that name."""
+    use_bias: bool = True
 
     @nn.compact
     def __call__(self, *inputs: Float[Array, "*_ inputs"]) -> Float[Array, "*n outputs"]:
         x = inputs
         for depth, width in enumerate(self.hidden):
-            y = nn.relu(Dense(width, name=f"layer{depth}")(*x))
+            y = nn.relu(Dense(width, self.use_bias, name=f"layer{depth}")(*x))
             if self.dropout:
                 y = nn.Dropout(self.dropout, deterministic=not self.has_rng("dropout"))(y)
             x = (y,)
         if self.out:
-            x = (Dense(self.out, name=f"layer{len(self.hidden)}")(*x),)
+            x = (Dense(self.out, self.use_bias, name=f"layer{len(self.hidden)}")(*x),)
         (y,) = x
         return y + Dense(y.shape[-1], use_bias=False, name="skip")(*inputs) if self.skip else y
 
@@ -76,10 +77,8 @@ class EdgeFunctions(nn.Module):
     @nn.compact
     def __call__(self, pairs: dict[str, Sequence[Array]]) -> dict[str, Array]:
         config = self.config
-        return {
-            name: MLP(config.edge_hidden, config.message, config.skip, config.dropout, name=name)(*inputs)
-            for name, inputs in pairs.items()
-        }
+        settings = (config.edge_hidden, config.message, config.skip, config.dropout, config.edge_bias)
+        return {name: MLP(*settings, name=name)(*inputs) for name, inputs in pairs.items()}
 
 
 class Nearness(nn.Module):

@@ -95,6 +95,7 @@ def check_encodable(model: Model) -> ModelConfig:
         reasons += ["it joins messages by " + ", ".join(config.aggregate)] * (config.aggregate != ("sum",))
         reasons += ["it sees only the nearest"] * (config.nearest is not None)
         reasons += ["it has a psi or linear paths beside its layers"] * (config.psi or config.skip)
+        reasons += ["its edge functions have no biases"] * (not config.edge_bias)
         reasons += ["it sees no goals and obstacles (context)"] * (not config.context)
     if reasons:
         raise NotEncodable(f"preset {preset} cannot be repaired: {'; '.join(reasons)}. Use preset thesis-ch5")

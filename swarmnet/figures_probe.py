@@ -1,13 +1,14 @@
 """What a network learned, to look at: force fields, contributions along a trajectory, figures 4.4 and 5.1."""
 
 import io
+from collections.abc import Mapping
 from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, PowerNorm
+from matplotlib.colors import LinearSegmentedColormap, LogNorm, PowerNorm
 from matplotlib.figure import Figure
 
 from envs.trajectories import AGENT, Trajectories, concatenate
@@ -20,6 +21,8 @@ KINDS = {"goal": "#009E73", "obstacle": "#D55E00", "agent": "#0072B2", NOTHING: 
 """Colours of edge types; grey is what is left without any edge."""
 MAGNITUDE = LinearSegmentedColormap.from_list("magnitude", mpl.colormaps["YlGnBu"](np.linspace(0, 0.62, 64)))
 """Light enough for dark arrows."""
+_GRID = LinearSegmentedColormap.from_list("errors", ["#9fd8b8", "#f7f3dc", "#ee9b7d"])
+"""Light enough for figures on it."""
 ARROWS = 13
 """Arrows in a row of a field, at most."""
 
@@ -122,6 +125,39 @@ def separation_figure(columns: dict[str, Column], scenes: tuple[int, ...] = (0, 
             titles.append(f"({name}) {' + '.join(column.kinds)}\n{figures}" if scene == scenes[0] else "")
     figure = paths_over_paths(concatenate(solid), concatenate(dashed), titles, columns=len(columns))
     figure.set_size_inches(1.35 * WIDE, figure.get_size_inches()[1] * 1.35)
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def error_grid(errors: Mapping[str, Mapping[str, float]], titles: Mapping[str, str], *, label: str) -> Figure:
+    """A line for each network, a square for each column: the error, coloured on a log scale. Grey where there is none.
+
+    Args:
+      errors: network -> column -> error.
+      titles: column -> what stands above it, in this order.
+      label: what the numbers are, below.
+    """
+    values = np.array([[row.get(name, np.nan) for name in titles] for row in errors.values()], float)
+    bad = ~(np.isfinite(values) & (values > 0))
+    figure = blank_figure(WIDE, 1.2 + 0.3 * len(values))
+    axes = figure.subplots()
+    good = values[~bad] if not bad.all() else np.ones(1)
+    scale = LogNorm(float(good.min()), max(float(good.max()), 1.01 * float(good.min())))
+    axes.set_facecolor("#d9dce1")
+    axes.pcolormesh(np.ma.masked_array(values, bad), norm=scale, cmap=_GRID, edgecolor="white", lw=1.5)
+    for (line, place), value in np.ndenumerate(values):
+        if not np.isnan(value):
+            text = f"{value:.2g}" if value < 100 else f"{value:.0f}"
+            axes.text(place + 0.5, line + 0.5, text, ha="center", va="center", fontsize=9)
+    axes.set_xticks(np.arange(len(titles)) + 0.5, list(titles.values()))
+    axes.set_yticks(np.arange(len(values)) + 0.5, list(errors))
+    axes.invert_yaxis()
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_xlabel(label)
+    for text in (*axes.get_xticklabels(), *axes.get_yticklabels(), axes.xaxis.label):
+        text.set_fontsize(9)
     return figure
 
 

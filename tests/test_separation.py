@@ -1,6 +1,7 @@
 """Figure 5.1: edge functions switched by the data, the same rules of the expert, and networks that are the law."""
 
-from dataclasses import replace
+import math
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,14 @@ from learning import published, quick_compiles
 from envs.experts.config import BoidsConfig, ChaserConfig, HelbingConfig
 from envs.trajectories import AGENT, OBSTACLE, Trajectories, TrajectoryError
 from gnn.checkpoint import Model
+from gnn.config import PRESETS as PRESETS_OF
 from gnn.forecast import forecast
 from gnn.laws import LawError, same_rules
 from gnn.separation import COLUMNS, rerun, separation, state_of, with_only
 from swarm_mjcf.errors import SpecError
-from swarmnet.figures_probe import separation_figure
+from swarmnet.figures_probe import error_grid, separation_figure
+from swarmnet.reproduce.experiment import Cell
+from swarmnet.reproduce.figure_5_1 import FIGURE_5_1, FIXED, MIXED, draw
 
 PRESETS = pytest.mark.parametrize("name", ["thesis-ch3", "thesis-ch5", "best"])
 
@@ -152,3 +156,41 @@ def test_the_figure_shows_each_subset_with_its_error_and_leaves_out_what_is_not_
     assert goals == [1, 0, 1, 0]
     solid = {line.get_gid(): line for line in figure.axes[3].lines}["solid 0"]
     np.testing.assert_allclose(np.asarray(solid.get_xdata()), columns["f"].predicted.position[1, :, 2, 0])
+
+
+def test_the_grid_has_a_line_for_each_network_and_no_number_where_there_is_none():
+    errors = {"one": {"a": 0.5, "b": 2e-5}, "other": {"a": 957.4, "b": math.inf}, "third": {"a": 0.0}}
+    figure = error_grid(errors, {"a": "(a)", "b": "(b)"}, label="error")
+    (axes,) = figure.axes
+    assert [text.get_text() for text in axes.texts] == ["0.5", "2e-05", "957", "inf", "0"]
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["one", "other", "third"]
+    (mesh,) = axes.collections
+    np.testing.assert_array_equal(np.ma.getmaskarray(mesh.get_array()), [[False, False], [False, True], [True, True]])
+
+
+def test_the_figure_of_all_networks_shows_the_mean_over_seeds_and_each_ones_sheet(tmp_path, monkeypatch):
+    done = []
+    for data, seed, value in ((MIXED, 0, 1.0), (MIXED, 1, 3.0), (FIXED, 0, 7.0)):
+        cell = Cell("swarmnet best", data, seed)
+        values = dict.fromkeys((c for d in FIGURE_5_1.data_sets if d.name == data for c in d.columns), value)
+        folder = cell.path(tmp_path)
+        folder.mkdir(parents=True)
+        for ending in (".png", ".pdf"):
+            (folder / f"shown{ending}").write_bytes(data.encode())
+        done.append((cell, {"values": values}))
+    seen = []
+    monkeypatch.setattr(
+        "swarmnet.reproduce.figure_5_1.error_grid", lambda *a, **k: (seen.append(a[0]), error_grid(*a, **k))[1]
+    )
+    files = {path.name for path in draw(tmp_path, done)}
+    assert files == {f"figure-5.1{which}{ending}" for which in ("", "-best") for ending in (".png", ".pdf")}
+    assert seen == [{"best": dict.fromkeys(COLUMNS, 2.0), "best, fixed": dict.fromkeys(COLUMNS, 7.0)}]
+    assert (tmp_path / "figure-5.1-best.png").read_bytes() == MIXED.encode()
+
+
+def test_networks_of_the_study_differ_in_one_thing():
+    for row in FIGURE_5_1.rows:
+        name = row.removeprefix("swarmnet ")
+        base = PRESETS_OF["thesis-ch5" if name.startswith("thesis-ch5") else "best"]
+        changed = [f.name for f in fields(base) if getattr(base, f.name) != getattr(PRESETS_OF[name], f.name)]
+        assert len(changed) == (0 if PRESETS_OF[name] is base else 2 if name == "separable" else 1), (name, changed)

@@ -288,6 +288,20 @@ def test_a_linear_path_beside_the_hidden_layers():
     assert set(params["node"]) == {"layer0", "layer1", "skip"}
 
 
+def test_edge_functions_without_biases_say_nothing_at_the_origin_of_their_inputs():
+    config = tiny("thesis-ch5-unbiased")
+    history, _, graph = random_swarm(16, COUNTS)
+    params = initial(config, scales(), history, graph)
+    assert {path.rsplit("/")[-1] for path in paths(params["edge"])} == {"kernel"}
+    still = np.zeros_like(history)
+    still[..., :2] = scales().centre
+    with_others = run(config, params, still, graph, scales())
+    nobody = replace(graph, **{kind: jnp.zeros_like(getattr(graph, kind)) for kind in ("goal", "obstacle", "agent")})
+    close(with_others, run(config, params, still, nobody, scales()))
+    moved = np.asarray(run(config, params, history, graph, scales()))
+    assert np.abs(moved - np.asarray(run(config, params, history, nobody, scales()))).max() > 0
+
+
 def test_dropped_neurons_are_drawn_from_the_key():
     config = replace(tiny("best"), dropout=0.5)
     history, _, graph = random_swarm(15, COUNTS)
