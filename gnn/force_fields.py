@@ -1,5 +1,6 @@
 """The output of an edge function as a force field: what one sender at a relative place adds to a lone receiver."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
@@ -55,6 +56,50 @@ class ForceField:
         size = float(np.sum(np.square(true, dtype=np.float64)))
         off = float(np.sum(np.square(learned - true, dtype=np.float64)))
         return (off / size) ** 0.5 if size else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spans:
+    """What fields are looked at over: a network knows nothing of distances and speeds that it never saw."""
+
+    speed: float
+    """Of the receiver, along y [m/s]."""
+    velocity: float
+    """Greatest difference of velocities on each axis [m/s]."""
+    agents: float
+    """Greatest distance of another agent on each axis [m]."""
+    others: float
+    """Of a goal or obstacle [m]."""
+    apart: float
+    """Distance of the other agent ahead while velocities vary [m]."""
+    beside: tuple[float, float]
+    """Place of a goal or obstacle while velocities vary [m]."""
+    goal: tuple[float, float]
+    """Where a lone receiver's goal is while other edges are looked at [m]: straight ahead."""
+
+
+SIMULATED = Spans(speed=5.0, velocity=10.0, agents=20.0, others=40.0, apart=4.0, beside=(3.0, 25.0), goal=(0.0, 60.0))
+"""Of swarms that fly at up to 10 m/s in an arena of 200 m."""
+PEOPLE_AROUND = 5.0
+"""Median distances to the nearest other that a field over positions reaches."""
+
+
+def spans_of(samples: Mapping[str, Float[np.ndarray, " n"]]) -> Spans:
+    """Of recordings, by what is seen in them (`gnn.ranges`): their median and greatest speed, and their spacing."""
+    speed, fast = (float(np.quantile(samples["speed"], share)) for share in (0.5, 0.99))
+    near = (
+        float(np.median(samples["spacing"])) if len(samples["spacing"]) else SIMULATED.apart * speed / SIMULATED.speed
+    )
+    unit = PEOPLE_AROUND * near
+    return Spans(
+        speed=speed,
+        velocity=2 * fast,
+        agents=unit,
+        others=2 * unit,
+        apart=near,
+        beside=(0.15 * unit, 1.25 * unit),
+        goal=(0.0, 3 * unit),
+    )
 
 
 def r_squared(true: Float[np.ndarray, "*n 2"], found: Float[np.ndarray, "*n 2"]) -> float:

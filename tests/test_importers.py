@@ -18,7 +18,7 @@ from scipy.io import savemat
 
 from envs.importers import ImportConfig, ImportFailed, import_files, read
 from envs.importers.holdout import held_out
-from envs.importers.importing import card_path, holdout_path
+from envs.importers.importing import VERSION, card_path, holdout_path
 from envs.importers.samples import sampled, spacing, time_step
 from envs.importers.scenes import assembled, cut, rows_per_scene
 from envs.importers.survey import survey
@@ -188,13 +188,13 @@ FORMS = {name: lambda d, w=w, n=n, c=c: (w(d / n), c) for name, (w, n, c) in WRI
 def test_the_same_walk_in_every_format(form: str, tmp_path: Path):
     t = trajectories(*FORMS[form](tmp_path))
     assert (t.dt, t.substeps, t.counts) == (0.2, 1, (0, 0, 3))
-    assert t.mask.shape == (1, 7, 3)
-    # A person's first row has no velocity, so the stay begins at the second.
-    assert t.mask[0].T.tolist() == [[False] + [True] * 6, [False] * 3 + [True] * 4, [False] + [True] * 6]
-    np.testing.assert_allclose(t.position[0, 1:, 0], [[0.2 * f, 1] for f in range(1, 7)], rtol=1e-6)
-    np.testing.assert_allclose(t.velocity[0, 1:, 0], [[1, 0]] * 6, atol=1e-5)
-    np.testing.assert_allclose(t.velocity[0, 3:, 1], [[0, 0.5]] * 4, atol=1e-5)
-    np.testing.assert_allclose(t.velocity[0, 1:, 2], [[0, 0]] * 4 + [[0, 1], [0, 0]], atol=1e-5)
+    assert t.mask.shape == (1, 6, 3)
+    # A person's first row has no velocity, so the stay begins at the second, and with the first such stay the run.
+    assert t.mask[0].T.tolist() == [[True] * 6, [False] * 2 + [True] * 4, [True] * 6]
+    np.testing.assert_allclose(t.position[0, :, 0], [[0.2 * f, 1] for f in range(1, 7)], rtol=1e-6)
+    np.testing.assert_allclose(t.velocity[0, :, 0], [[1, 0]] * 6, atol=1e-5)
+    np.testing.assert_allclose(t.velocity[0, 2:, 1], [[0, 0.5]] * 4, atol=1e-5)
+    np.testing.assert_allclose(t.velocity[0, :, 2], [[0, 0]] * 4 + [[0, 1], [0, 0]], atol=1e-5)
     assert (t.edges[0] == AGENT_EDGE * (1 - np.eye(3))).all()
     for name in ("agent_contact", "solid_contact", "depth", "radius"):
         assert not getattr(t, name).any(), name
@@ -242,9 +242,9 @@ def test_goals_and_obstacles_of_a_long_table(tmp_path: Path):
     t = trajectories(path, config)
     assert t.counts == (1, 2, 1)
     assert t.kind[0].tolist() == [GOAL, OBSTACLE, OBSTACLE, AGENT]
-    assert t.mask[0].T.tolist() == [[True] * 5, [False] + [True] * 4, [True] * 5, [False] + [True] * 4]
-    np.testing.assert_array_equal(t.position[0, :, 2], [[7, 7]] * 5)
-    np.testing.assert_allclose(t.velocity[0, 1:, 1], [[0, 10], [0, 10], [0, 0], [0, 0]], atol=1e-5)
+    assert t.mask[0].T.tolist() == [[True] * 4] * 4  # from the walker's second row on
+    np.testing.assert_array_equal(t.position[0, :, 2], [[7, 7]] * 4)
+    np.testing.assert_allclose(t.velocity[0, :, 1], [[0, 10], [0, 10], [0, 0], [0, 0]], atol=1e-5)
     assert not t.velocity[0, :, [0, 2]].any()
     with pytest.raises(ImportFailed, match=r"types 'pedestrian', 'pillar' are none of goal, obstacle, agent"):
         read(path, replace(config, types=()))
@@ -459,9 +459,9 @@ def test_an_empty_file_and_one_agent_in_every_format(format: str, tmp_path: Path
         read(tmp_path / name, config)
     (tmp_path / name).unlink()
     t = trajectories(write(tmp_path / name, WALK[:7]), config, tmp_path / "out.h5")
-    assert t.mask.shape == (1, 7, 1)
+    assert t.mask.shape == (1, 6, 1)
     assert not t.edges.any()
-    np.testing.assert_allclose(t.velocity[0, 1:, 0], [[1, 0]] * 6, atol=1e-5)
+    np.testing.assert_allclose(t.velocity[0, :, 0], [[1, 0]] * 6, atol=1e-5)
 
 
 BROKEN = {
@@ -479,6 +479,11 @@ BROKEN = {
     "csv no unit": (text("a.csv", "t,id,x,y\n0,1,2,3\n"), ImportConfig(time_unit="s"), "give --unit, one of m"),
     "csv no time unit": (text("a.csv", "t,id,x,y\n0,1,2,3\n"), ImportConfig(unit="m"), "give --time-unit"),
     "csv frames without rate": (text("a.csv", "frame,id,x,y\n0,1,2,3\n"), ImportConfig(unit="m"), "give --fps"),
+    "csv unit of times beside frames": (
+        text("a.csv", "frame,id,x,y\n0,1,2,3\n1,1,2,3\n"),
+        replace(METRES, fps=25.0),
+        "--time-unit says s, and the only clock is column 'frame', which counts frames; leave --time-unit out, or say",
+    ),
     "csv rate beside times": (
         text("a.csv", "t,id,x,y\n0,1,2,3\n"),
         replace(METRES, fps=25.0),
@@ -1056,6 +1061,10 @@ def test_import_writes_a_card_and_keeps_what_is_there(tmp_path: Path, capsys, mo
     assert card_path(out).read_text() == card, "a card that was deleted is written again"
     assert main((*arguments, "--radius", "0.2")) == 2
     assert "exists and holds something else" in capsys.readouterr().err
+    monkeypatch.setattr("envs.importers.importing.VERSION", VERSION + 1)
+    assert main(arguments) == 2
+    assert "by an older version, which made other rows of them; delete it, or" in capsys.readouterr().err
+    assert out.read_bytes() == written
 
 
 def test_many_files_outliers_and_gaps_fit_into_the_header(tmp_path: Path):
@@ -1090,10 +1099,10 @@ def test_who_is_left_out_is_said(tmp_path: Path, capsys):
 
 
 def test_rows_of_segments_that_are_cut_away_are_counted(tmp_path: Path, capsys):
-    """Rows 1 to 6 of the grid in segments of 3: row 6 is alone in the third."""
+    """The 6 rows with velocities in segments of 5: the last is alone in the second."""
     path, out = csv(tmp_path / "w.csv", WALK[:7]), tmp_path / "out.h5"
     declared = ("--unit", "m", "--time-unit", "s", "--out", str(out))
-    assert main(("import", str(path), "--segment", "0.6", *declared)) == 0
+    assert main(("import", str(path), "--segment", "1.0", *declared)) == 0
     words = "left out: 1 of 6 rows of agents, in segments that have agents in one row only (everything)\n"
     assert words in capsys.readouterr().out
     assert load(out).mask.sum() == 5
@@ -1107,7 +1116,7 @@ def test_coordinates_too_large_for_single_precision_ask_for_an_origin(tmp_path: 
     with pytest.raises(ImportFailed, match=r"coordinates reach 5e\+06 m.*--origin X Y"):
         trajectories(path, METRES)
     t = trajectories(path, replace(METRES, origin=(5e6, 4e6)))
-    np.testing.assert_allclose(t.velocity[0, 1:, 0], [[1, 0]] * 6, atol=1e-4)
+    np.testing.assert_allclose(t.velocity[0, :, 0], [[1, 0]] * 6, atol=1e-4)
 
 
 def test_nothing_is_left_of_an_import_that_fails_while_it_writes(tmp_path: Path):

@@ -12,18 +12,21 @@ from envs.config import SimulateConfig, make_world
 from envs.experts.config import BoidsConfig, ChaserConfig, HelbingConfig, VicsekConfig
 from envs.noise import ActuationNoise
 from envs.simulate import simulate
-from envs.storage import load
+from envs.storage import load, save
 from gnn.baselines.config import PRESETS as RIVALS
 from gnn.checkpoint import Model
+from gnn.config import TrainConfig
 from gnn.contributions import NOTHING, along, contributions, only_edges
 from gnn.decode import network
 from gnn.evaluate import prediction_error
-from gnn.force_fields import ForceField, effect, force_field, r_squared
+from gnn.force_fields import ForceField, effect, force_field, r_squared, spans_of
 from gnn.graph import EDGE_TYPES
 from gnn.laws import LawError, law_predict, pair_force, same_rules
 from gnn.messages import NoEdgeFunctionsError, acceleration, edge_kinds, messages, swarmnet_config
 from gnn.probe import fit_linear, linear_probe
+from gnn.train import train
 from swarm_mjcf.errors import SpecError
+from swarmnet.cli import main
 from swarmnet.figures import svg
 from swarmnet.figures_probe import contribution_figure, force_field_figure, png
 
@@ -273,3 +276,40 @@ def test_the_noise_of_a_law_has_the_size_asked_for():
 def test_the_law_of_chasers_is_no_predictor():
     with pytest.raises(LawError, match="chasers"):
         law_predict(make_world("chaser"))
+
+
+# --- the command ---
+
+
+def test_fields_of_recordings_reach_what_people_keep_between_them():
+    """By hand: median speed 1.2, of the fastest 2 m/s; median distance 0.8 m."""
+    seen = {"agents": np.ones(3), "speed": np.asarray([1.0, 1.2, 2.0]), "spacing": np.asarray([0.5, 0.8, 3.0])}
+    span = spans_of(seen)
+    assert (span.speed, span.apart) == (1.2, 0.8)
+    assert span.velocity == pytest.approx(2 * (1.2 + 0.98 * 0.8))
+    assert (span.agents, span.others, *span.goal) == pytest.approx((4.0, 8.0, 0.0, 12.0))
+    assert spans_of(seen | {"spacing": np.zeros(0)}).apart == pytest.approx(0.8 * 1.2)  # 4 m at 5 m/s
+
+
+def test_a_probe_looks_anew_and_leaves_no_picture_of_another_network(tmp_path, capsys):
+    """Of a recording in metres per second, then of a simulated world: what the second cannot draw is gone."""
+    config = SimulateConfig(scenes=6, steps=8, num_agents=3, num_obstacles=0, seed=3)
+    simulate(config, tmp_path / "d.h5")
+    slow = load(tmp_path / "d.h5")
+    slow = replace(slow, position=slow.position / 8, velocity=slow.velocity / 8, provenance={"import": {}})
+    save(tmp_path / "slow.h5", slow)
+    training = TrainConfig(model="best", horizons=(1,), stage_steps=(2,), chunk=2, batch=4)
+    run = tmp_path / "r"
+    train(training, load(tmp_path / "d.h5"), run)
+    figures = run / "figures"
+    figures.mkdir(exist_ok=True)
+    for name in ("figure-5.1.svg", "prediction.svg"):
+        (figures / name).write_text("old")
+    assert main(("probe", str(run), "--data", str(tmp_path / "slow.h5"))) == 0
+    assert "what law made these trajectories is not known" in capsys.readouterr().out
+    drawn = {path.name for path in figures.iterdir()}
+    assert drawn == {"probe-position.svg", "probe-velocity.svg", "probe-contributions.svg", "prediction.svg"}
+    near = (figures / "probe-velocity.svg").read_bytes()
+    assert main(("probe", str(run), "--data", str(tmp_path / "d.h5"), "--seed", "9")) == 0
+    assert (figures / "figure-5.1.svg").exists()
+    assert (figures / "probe-velocity.svg").read_bytes() != near

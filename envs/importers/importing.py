@@ -13,7 +13,7 @@ from envs.importers import card
 from envs.importers.config import ImportConfig
 from envs.importers.holdout import held_out
 from envs.importers.registry import check_options, read
-from envs.importers.samples import sampled, time_step
+from envs.importers.samples import from_first_agent, sampled, time_step
 from envs.importers.scenes import assembled, cut, rows_per_scene
 from envs.importers.survey import Survey, survey
 from envs.importers.tracks import ImportFailed, Update, readable
@@ -22,6 +22,9 @@ from envs.storage import Header, TrajectoryWriter, read_header
 from envs.trajectories import TrajectoryError, versions
 from swarm_mjcf.whole import WholeFile
 
+VERSION = 2
+"""Counted up when the same files and options give other trajectories, so that a file made before is not taken for one
+made now. 2: runs begin with the first row that an agent is in."""
 BLUR = 0.1
 """Single precision must tell positions apart by this share of a median step at least."""
 
@@ -73,8 +76,9 @@ def import_files(
     sources = [_source(path) for path in files]
     check_options(files, config)
     outs = [out, *([holdout_path(out)] if config.holdout else [])]
-    mark = fingerprint(sources, config)
-    have = [_existing(path, mark) for path in outs]
+    marks = [fingerprint(sources, config, version) for version in range(1, VERSION + 1)]
+    mark = marks[-1]
+    have = [_existing(path, marks) for path in outs]
     if all(have):
         for path, header in zip(outs, have, strict=True):
             if header is not None and not card_path(path).exists():
@@ -88,7 +92,7 @@ def import_files(
     dt = time_step(tracks, config)
     everything = []
     for number, track in enumerate(tracks):
-        everything.append(sampled(track, dt, config))
+        everything.append(from_first_agent(sampled(track, dt, config), dt))
         update(number + 1, len(tracks), "resample")
     runs = [run for run in everything if run.agents.any()]
     if not runs:
@@ -125,9 +129,11 @@ def import_files(
     return Imported(headers[0], headers[1] if config.holdout else None, existed=False)
 
 
-def fingerprint(sources: Sequence[dict], config: ImportConfig) -> str:
-    """What the result depends on, as a short hash: the files' bytes and the options."""
+def fingerprint(sources: Sequence[dict], config: ImportConfig, version: int = VERSION) -> str:
+    """What the result depends on, as a short hash: the files' bytes, the options, and how they are understood."""
     about = {"sources": [source["sha256"] for source in sources], "import": plain(config)}
+    if version > 1:  # as the first one was written
+        about["version"] = version
     return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -142,11 +148,18 @@ def _source(path: Path) -> dict:
     return {"name": path.name, "bytes": size, "sha256": digest.hexdigest()}
 
 
-def _existing(path: Path, mark: str) -> Header | None:
+def _existing(path: Path, marks: Sequence[str]) -> Header | None:
+    """The header of a file that holds what the last of `marks` stands for; earlier ones are of older versions."""
     if not path.exists():
         return None
     header = read_header(path)
-    if header.provenance.get("fingerprint") != mark:
+    made = header.provenance.get("fingerprint")
+    if made in marks[:-1]:
+        raise TrajectoryError(
+            f"{path}: was imported from the same files by an older version, which made other rows of them; delete "
+            "it, or choose another name"
+        )
+    if made != marks[-1]:
         raise TrajectoryError(f"{path}: exists and holds something else; choose another name or delete it first")
     return header
 

@@ -78,6 +78,12 @@ def runs_of(
             f"{path}: --fps says {config.fps:g} frames per second, and column {columns['t'].name!r} holds times; leave "
             "--fps out, or say that it counts frames: --time-unit frame"
         )
+    if clock == "frame" and config.time_unit not in (None, "frame"):
+        raise ImportFailed(
+            f"{path}: --time-unit says {config.time_unit}, and the only clock is column {columns['frame'].name!r}, "
+            f"which counts frames; leave --time-unit out, or say that it holds times: --columns "
+            f"t={columns['frame'].name}"
+        )
     to_seconds, time_fact = seconds(path, config, "frame" if clock == "frame" else units["t"])
     scale, said = {}, {}
     for axis in ("x", "y", *(("z",) if "z" in columns else ())):

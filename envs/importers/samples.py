@@ -155,6 +155,18 @@ def sampled(tracks: Tracks, dt: float, config: ImportConfig) -> Samples:
     )
 
 
+def from_first_agent(run: Samples, dt: float) -> Samples:
+    """The same run from the first row on that any agent is in; the published arrays stay whole.
+
+    By differences nobody has a velocity in a recording's first row, and formats without masks refuse scenes that begin
+    empty.
+    """
+    whole = run.tracks.edges is not None
+    if whole or not (agents := run.agents).any() or not (first := int(run.row[agents].min())):
+        return run
+    return replace(run.take(run.row >= first, first=first), start=run.start + first * dt)
+
+
 def _gaps(tracks: Tracks, person: int, time: np.ndarray, least: float, config: ImportConfig) -> list[Gap]:
     steps = np.diff(time)
     found = [

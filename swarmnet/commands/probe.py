@@ -16,10 +16,11 @@ from envs.storage import load
 from envs.trajectories import AGENT, Trajectories
 from gnn.checkpoint import Model, load_model
 from gnn.contributions import along
-from gnn.force_fields import ForceField, force_field
+from gnn.force_fields import SIMULATED, ForceField, Spans, force_field, spans_of
 from gnn.laws import LawError
 from gnn.messages import edge_kinds
 from gnn.probe import linear_probe
+from gnn.ranges import samples_of
 from gnn.separation import HORIZONS, separation
 from swarm_mjcf.errors import SpecError, SwarmError
 from swarmnet.config import Probe
@@ -33,8 +34,8 @@ PROBED = 4
 """Scenes that the linear probe needs: it is fitted to a half and tested on the other."""
 DRAWN = 3
 """Agents whose contributions are drawn."""
-GOAL = (0.0, 60.0)
-"""Where a lone receiver's goal is while other edges are looked at [m]: straight ahead."""
+PICTURES = ("probe-position", "probe-velocity", "probe-contributions", "figure-5.1")
+"""What may be in RUN/figures after it; one that this call cannot draw is removed, as it would show another network."""
 
 
 @mpl.rc_context(STYLE)
@@ -48,7 +49,10 @@ def run(config: Probe) -> int:
     if not 0 <= config.scene < len(data):
         raise SpecError("scene", config.scene, f"from 0 to {len(data) - 1}")
     found: dict[str, Any] = {"scenes": len(data), "dt": data.dt}
-    fields = [_known(model, kind, expert, over) for kind in kinds for over in ("position", "velocity")]
+    for name in PICTURES:
+        (config.run / "figures" / f"{name}.svg").unlink(missing_ok=True)
+    span = SIMULATED if expert is not None else spans_of(samples_of(data))
+    fields = [_known(model, kind, expert, over, span) for kind in kinds for over in ("position", "velocity")]
     found["force_fields"] = [
         {"kind": f.kind, "over": f.over, "r2": _finite(f.r2), "relative_error": _finite(f.relative_error)}
         for f in fields
@@ -135,14 +139,20 @@ def _draw_contributions(config: Probe, model: Model, data: Trajectories) -> None
         print(f"contributions: drawn for the first {DRAWN} of the {len(agents)} agents of scene {scene}")
 
 
-def _known(model: Model, kind: str, expert: ExpertConfig | None, over: str) -> ForceField:
+def _known(model: Model, kind: str, expert: ExpertConfig | None, over: str, span: Spans) -> ForceField:
     """The field beside the true law, or alone where the expert has no law for this type."""
-    goal = GOAL if kind != "goal" and "goal" in edge_kinds(model) else None
-    apart = (0.0, 4.0) if kind == "agent" else (3.0, 25.0)
+    reach = span.velocity if over == "velocity" else span.agents if kind == "agent" else span.others
+    at: dict[str, Any] = {
+        "over": over,
+        "reach": reach,
+        "velocity": (0.0, span.speed),
+        "goal": span.goal if kind != "goal" and "goal" in edge_kinds(model) else None,
+        "apart": (0.0, span.apart) if kind == "agent" else span.beside,
+    }
     try:
-        return force_field(model, kind, expert, over=over, goal=goal, apart=apart)
+        return force_field(model, kind, expert, **at)
     except LawError:
-        return force_field(model, kind, None, over=over, goal=goal, apart=apart)
+        return force_field(model, kind, None, **at)
 
 
 def _finite(value: float) -> float | None:
