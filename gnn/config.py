@@ -94,6 +94,7 @@ PRESETS: dict[str, ModelConfig] = {
     "best-all": replace(_BEST, aggregate=("sum", "mean", "max")),
     # What separates the edge functions (section 5.6.2): from both ends, one thing changed.
     "best-world": replace(_BEST, frame=False),
+    "best-hidden": replace(_BEST, skip=False),
     "best-narrow": replace(_BEST, message=2),
     "best-unbiased": replace(_BEST, edge_bias=False),
     "thesis-ch5-frame": ModelConfig(normalise=True, frame=True),
