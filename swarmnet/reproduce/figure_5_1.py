@@ -102,12 +102,13 @@ FIGURE_5_1 = Experiment(
     leading=LEADING,
     run=run,
     notes="Each column is normalized by the changes in its own truth. Learned from runs of 1 to 5 agents with and "
-    "without an obstacle, in columns `fixed` from runs of 5 agents and one obstacle; all tested on the mixed ones. "
-    "Networks: `best` and chapter 5's as they are, with forces for messages (`separable`), and with one thing changed: "
-    "messages joined by their sum or mean alone, edge functions on raw states of the world (`world`) or in the "
-    "receiver's frame (`frame`), functions without linear paths beside their hidden layers (`hidden`), messages of 2 numbers (`narrow`), edge functions without biases (`unbiased`). An absent edge has no "
-    "message in any of them. The virtual walls are part of the obstacle rule, "
-    "but no edge carries them: the truth has them in the columns with that rule, as coded; in all (`walls stay`), as "
-    "in every scene the network has seen; or in none (`no walls`).",
+    "without an obstacle, in columns `fixed` from runs of 5 agents and one obstacle; all tested on the mixed "
+    "ones. Networks: `best` and chapter 5's as they are, with forces for messages (`separable`), and with one "
+    "thing changed: messages joined by their sum or mean alone, edge functions on raw states of the world "
+    "(`world`) or in the receiver's frame (`frame`), functions without linear paths beside their hidden "
+    "layers (`hidden`), messages of 2 numbers (`narrow`), edge functions without biases (`unbiased`). An "
+    "absent edge has no message in any of them. The virtual walls are part of the obstacle rule, but no edge "
+    "carries them: the truth has them in the columns with that rule, as coded; in all (`walls stay`), as in "
+    "every scene the network has seen; or in none (`no walls`).",
     figure=draw,
 )
