@@ -149,7 +149,7 @@ def render_page(folder: str | Path) -> str:
         most = max((row.get("n", 1) for row in document["rows"]), default=1)
         lines += [
             "",
-            f"## {document['name']}",
+            f"## {path.stem}",
             "",
             f"`{document['command']}`, commit {document['commit']}, {document['date'][:10]}, {machine['cpu']} with "
             f"{machine['cores']} cores, {', '.join(machine['devices'])}, mujoco {used['mujoco']}, jax {used['jax']}"
@@ -160,8 +160,15 @@ def render_page(folder: str | Path) -> str:
             "| | " + " | ".join(names) + " |",
             "|---|" + "---:|" * len(names),
         ]
-        for column in columns:
-            lines.append(f"| {column} | " + " | ".join(_cell(cells.get((name, column)), most) for name in names) + " |")
+        bounds = {end: column for column in columns for end in (f"{column}, low", f"{column}, high")}
+        for column in (column for column in columns if column not in bounds):
+            shown = [
+                _cell(
+                    cells.get((name, column)), most, [cells.get((name, f"{column}, {end}")) for end in ("low", "high")]
+                )
+                for name in names
+            ]
+            lines.append(f"| {column} | " + " | ".join(shown) + " |")
         lines += [f"\n{text}" for text in uneven(document["rows"])]
         lines += [f"\n![{name}](media/{name}.png)" for name in pictures[path.stem]]
     return "\n".join(lines) + "\n"
@@ -235,11 +242,13 @@ def unfinished(document: Mapping) -> list[str]:
     return lines + [f"failed: {one['row']}, {one['data']}, seed {one['seed']}: {one['reason']}" for one in failed]
 
 
-def _cell(row: dict | None, most: int) -> str:
-    """Of `most` seeds nothing is said, of fewer how many they are."""
+def _cell(row: dict | None, most: int, bounds: Sequence[dict | None] = ()) -> str:
+    """With the bounds `low` and `high` where both are known. Of `most` seeds nothing is said, of fewer how many."""
     if row is None or row["value"] is None:
         return ""
     text = f"{row['value']:.4g}" + (f" ± {row['std']:.2g}" if row["std"] is not None else "")
+    ends = [bound["value"] for bound in bounds if bound is not None and bound["value"] is not None]
+    text += f" [{ends[0]:.3g}, {ends[1]:.3g}]" if len(ends) == 2 else ""
     text += f" (n = {row['n']})" if row.get("n", most) < most else ""
     return text + (f" (thesis {row['reference']:.4g})" if row["reference"] is not None else "")
 

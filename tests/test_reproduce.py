@@ -343,6 +343,17 @@ def test_the_page_marks_figures_of_fewer_seeds_than_others(tmp_path: Path):
     assert "| a | 1.5 |" in rendered(tmp_path / "b", [judged("x", n=1, std=None)])
 
 
+def test_bounds_stand_behind_their_value(tmp_path: Path):
+    """Columns `a, low` and `a, high` are no lines of their own; one that has no value of its own is."""
+    ends = [judged("x", "a, low", value=1.25), judged("x", "a, high", value=1.8351)]
+    lines = rendered(tmp_path / "a", [judged("x"), judged("y"), *ends, judged("x", "b, low")])
+    assert lines[-3:] == [
+        "|---|---:|---:|",
+        "| a | 1.5 ± 0.25 [1.25, 1.84] | 1.5 ± 0.25 |",
+        "| b, low | 1.5 ± 0.25 |  |",
+    ]
+
+
 def test_the_page_marks_uneven_work(tmp_path: Path):
     """More than a factor of 2 between seeds: 800 and 7100 are, 700 and 1400 are not."""
     rows = [
