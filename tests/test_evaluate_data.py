@@ -194,7 +194,8 @@ def test_learning_from_a_file_to_a_report(here: Path, monkeypatch: pytest.Monkey
 def test_a_probe_of_a_recording(name: str, window: int, here: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     held, drawn = load("w_holdout.h5"), {}
     assert len(held) == 2
-    assert not held.mask[0, 0].any(), "nobody has a velocity in the first row"
+    assert held.mask[0, 0].any(), "an import begins with the first row that somebody has a velocity in"
+    assert not held.mask[0, 0].all(), "somebody comes later"
     monkeypatch.setattr(probe, "DRAWN", 2)
     figure = probe.contribution_figure
     monkeypatch.setattr(
@@ -221,7 +222,7 @@ def test_a_probe_of_a_recording(name: str, window: int, here: Path, monkeypatch:
 
 def test_what_a_probe_of_a_recording_cannot_draw_is_said(here: Path, capsys):
     held = load("w_holdout.h5")
-    short = held.mask & (np.arange(held.mask.shape[1]) < 5)[:, None]  # 4 rows with velocities, and the model sees 5
+    short = held.mask & (np.arange(held.mask.shape[1]) < 4)[:, None]  # and the model sees 5
     save("short.h5", replace(held, mask=short))
     (Path("thesis-ch3") / "figures" / "probe-contributions.svg").unlink(missing_ok=True)
     assert probe.run(Probe(run=Path("thesis-ch3"), data=Path("short.h5"))) == 0
