@@ -6,7 +6,7 @@ from typing import Any
 
 def plain(config: Any) -> dict[str, Any]:
     """A frozen dataclass as plain JSON values."""
-    return _walk(dataclasses.asdict(config), lambda x: "inf" if x == float("inf") else x)
+    return _plain_values(dataclasses.asdict(config))
 
 
 def from_plain[T](kind: type[T], values: dict[str, Any]) -> T:
@@ -23,10 +23,20 @@ def from_plain[T](kind: type[T], values: dict[str, Any]) -> T:
     return kind(**{key: _restored(value) for key, value in values.items()})
 
 
+def completed(kind: type, values: dict[str, Any]) -> dict[str, Any]:
+    """What `plain` wrote, with the defaults of the fields that `kind` has got since."""
+    new = {f.name: f.default for f in dataclasses.fields(kind) if f.name not in values}
+    return _plain_values({k: v for k, v in new.items() if v is not dataclasses.MISSING}) | values
+
+
 def _restored(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(value)
     return float("inf") if value == "inf" else value
+
+
+def _plain_values(values: dict[str, Any]) -> dict[str, Any]:
+    return _walk(values, lambda x: "inf" if x == float("inf") else x)
 
 
 def _walk(tree: Any, leaf: Any) -> Any:

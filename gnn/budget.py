@@ -12,7 +12,7 @@ from pathlib import Path
 
 import jax
 
-from envs.plain import plain
+from envs.plain import completed, plain
 from envs.trajectories import Trajectories
 from gnn.checkpoint import CheckpointError, Model
 from gnn.config import TrainConfig
@@ -104,6 +104,7 @@ def _read(path: Path, asked: dict) -> tuple[int, ...]:
     try:
         plan = json.loads(path.read_text())
         had, stage_steps = {key: plan[key] for key in asked}, tuple(int(steps) for steps in plan["stage_steps"])
+        had["given"] = completed(TrainConfig, had["given"])
     except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path}: no plan of a training ({error}); take another run name") from error
     if had != asked:

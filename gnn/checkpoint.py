@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from envs.plain import from_plain, plain
+from envs.plain import completed, from_plain, plain
 from gnn.config import AnyModelConfig, config_kinds
 from gnn.decode import Integrator
 from gnn.family import Params, Predict
@@ -149,6 +149,17 @@ def describe(config: AnyModelConfig, scales: Scales, integrator: Integrator) -> 
         "scales": {name: np.asarray(value, np.float64).tolist() for name, value in vars(scales).items()},
         "integrator": plain(integrator),
     }
+
+
+def check_same(folder: Path, had: dict, about: dict, **kinds: type) -> None:
+    """Raises CheckpointError where a run that is gone on with was of other settings. A setting that did not exist when
+    `had` was stored counts as its default, where `kinds` names the type of an entry."""
+    had = had | {name: completed(kind, had[name]) for name, kind in kinds.items() if name in had}
+    different = [key for key in about if had.get(key) != about[key]]
+    if different:
+        raise CheckpointError(
+            f"{folder}: holds a run with other settings ({', '.join(different)} differ); take another run name"
+        )
 
 
 def load_model(folder: str | Path) -> Model:

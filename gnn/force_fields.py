@@ -85,11 +85,11 @@ PEOPLE_AROUND = 5.0
 
 
 def spans_of(samples: Mapping[str, Float[np.ndarray, " n"]]) -> Spans:
-    """Of recordings, by what is seen in them (`gnn.ranges`): their median and greatest speed, and their spacing."""
-    speed, fast = (float(np.quantile(samples["speed"], share)) for share in (0.5, 0.99))
-    near = (
-        float(np.median(samples["spacing"])) if len(samples["spacing"]) else SIMULATED.apart * speed / SIMULATED.speed
-    )
+    """Of recordings in which somebody moves, by what is seen in them (`gnn.ranges`): speeds of those who move, spacing."""
+    moving = samples["speed"][samples["speed"] > 0]
+    speed, fast = (float(np.quantile(moving, share)) for share in (0.5, 0.99))
+    spacing = samples["spacing"][samples["spacing"] > 0]
+    near = float(np.median(spacing)) if len(spacing) else SIMULATED.apart * speed / SIMULATED.speed
     unit = PEOPLE_AROUND * near
     return Spans(
         speed=speed,

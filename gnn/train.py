@@ -21,7 +21,7 @@ from jaxtyping import Float, Key
 from envs.plain import plain
 from envs.record import Array
 from envs.trajectories import Trajectories
-from gnn.checkpoint import CheckpointError, Checkpoints, Model, describe
+from gnn.checkpoint import Checkpoints, Model, check_same, describe
 from gnn.config import AnyModelConfig, TrainConfig, model_preset
 from gnn.decode import Integrator
 from gnn.evaluate import natural_change
@@ -185,11 +185,7 @@ def train_prepared(prepared: Prepared, folder: str | Path, *, progress: Progress
         state = prepared.start()
     else:
         step, had, _ = found
-        different = [key for key in about if had.get(key) != about[key]]
-        if different:
-            raise CheckpointError(
-                f"{folder}: holds a run with other settings ({', '.join(different)} differ); take another run name"
-            )
+        check_same(folder, had, about, model=type(prepared.preset), train=TrainConfig)
         checkpoints.drop_after(step)
         state = checkpoints.restore(step, jax.eval_shape(prepared.start))
     done = int(state["step"])

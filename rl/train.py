@@ -18,7 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from envs.plain import plain
 from envs.record import Array
-from gnn.checkpoint import CheckpointError, Checkpoints, Model, describe
+from gnn.checkpoint import CheckpointError, Checkpoints, Model, check_same, describe
 from gnn.freeze import frozen
 from gnn.metrics import Metrics, read_metrics
 from gnn.train import Progress, fingerprint
@@ -125,12 +125,11 @@ def train(
     state = learner.start()
     if found is not None:
         step, had, _ = found
-        different = [key for key in about if had.get(key) != about[key]]
-        if different:
+        try:
+            check_same(folder, had, about, model=type(model.config), rl=PPOConfig, reward=type(task.reward))
+        except CheckpointError:
             checkpoints.close()
-            raise CheckpointError(
-                f"{folder}: holds a run with other settings ({', '.join(different)} differ); take another run name"
-            )
+            raise
         checkpoints.drop_after(step)
         whole = gathered(state, mesh)
         state = placed(_unpacked(checkpoints.restore(step, _packed(whole)), whole), state, mesh)

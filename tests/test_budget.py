@@ -91,6 +91,8 @@ def test_an_interrupted_run_keeps_its_plan(tmp_path: Path, monkeypatch):
     assert plan["stage_steps"] == [12, 6]
     assert plan["pace"] == {"compile_seconds": 0.0, "chunk_seconds": [1.0, 5.0]}
     monkeypatch.setattr(gnn.budget, "measured", None)  # nobody asks again
+    del plan["given"]["noise"]  # a setting that did not exist then
+    (tmp_path / "run" / "plan.json").write_text(json.dumps(plan))
     model = train_for(minutes, CONFIG, spring(), tmp_path / "run")
     assert model.about["train"]["stage_steps"] == [12, 6]
     assert_same(model.params, train(expected, spring(), tmp_path / "whole").params)

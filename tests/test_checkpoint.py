@@ -10,7 +10,8 @@ import pytest
 from helpers import assert_same
 from learning import INTEGRATOR, initial, random_swarm, scales, tiny
 
-from gnn.checkpoint import CheckpointError, Checkpoints, describe, load_model
+from gnn.checkpoint import CheckpointError, Checkpoints, check_same, describe, load_model
+from gnn.config import ModelConfig
 from gnn.decode import Integrator, make_predict
 from swarm_mjcf.errors import SwarmError
 
@@ -35,6 +36,24 @@ def folder(tmp_path: Path) -> Path:
     checkpoints.save(20, state(2, 20), about)
     checkpoints.close()
     return tmp_path / "checkpoints"
+
+
+def test_a_run_goes_on_after_a_setting_has_come_into_being():
+    """What was stored before a field existed has its default."""
+    about = {"seed": 1, **describe(CONFIG, scales(), INTEGRATOR)}
+    old = {name: value for name, value in about["model"].items() if name != "edge_bias"}
+    check_same(Path("r"), about | {"model": old, "step": 3}, about, model=ModelConfig)
+    check_same(Path("r"), about | {"step": 3}, about)
+    unbiased = about | {"model": old | {"edge_bias": False}}
+    for had, now, kinds in (
+        (about | {"model": old}, about, {}),
+        (about | {"model": old}, unbiased, {"model": ModelConfig}),
+        (about | {"model": old | {"gone": 1}}, about, {"model": ModelConfig}),
+    ):
+        with pytest.raises(CheckpointError, match=r"r: holds a run with other settings \(model differ\)"):
+            check_same(Path("r"), had, now, **kinds)
+    with pytest.raises(CheckpointError, match=r"\(seed, model differ\)"):
+        check_same(Path("r"), unbiased | {"seed": 2}, about, model=ModelConfig)
 
 
 def test_a_loaded_model_predicts_to_the_bit_what_was_saved(folder: Path):

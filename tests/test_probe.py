@@ -289,10 +289,15 @@ def test_fields_of_recordings_reach_what_people_keep_between_them():
     assert span.velocity == pytest.approx(2 * (1.2 + 0.98 * 0.8))
     assert (span.agents, span.others, *span.goal) == pytest.approx((4.0, 8.0, 0.0, 12.0))
     assert spans_of(seen | {"spacing": np.zeros(0)}).apart == pytest.approx(0.8 * 1.2)  # 4 m at 5 m/s
+    standing = seen | {
+        "speed": np.append(seen["speed"], np.zeros(9)),
+        "spacing": np.append(seen["spacing"], np.zeros(9)),
+    }
+    assert spans_of(standing) == span, "who stands and who is not apart has no scale"
 
 
 def test_a_probe_looks_anew_and_leaves_no_picture_of_another_network(tmp_path, capsys):
-    """Of a recording in metres per second, then of a simulated world: what the second cannot draw is gone."""
+    """Of a recording at some metres per second, whose figure 5.1 of another network goes; then of a simulated world."""
     config = SimulateConfig(scenes=6, steps=8, num_agents=3, num_obstacles=0, seed=3)
     simulate(config, tmp_path / "d.h5")
     slow = load(tmp_path / "d.h5")
@@ -313,3 +318,8 @@ def test_a_probe_looks_anew_and_leaves_no_picture_of_another_network(tmp_path, c
     assert main(("probe", str(run), "--data", str(tmp_path / "d.h5"), "--seed", "9")) == 0
     assert (figures / "figure-5.1.svg").exists()
     assert (figures / "probe-velocity.svg").read_bytes() != near
+    save(tmp_path / "still.h5", replace(slow, velocity=np.zeros_like(slow.velocity)))
+    before = {path.name: path.read_bytes() for path in figures.iterdir()}
+    assert main(("probe", str(run), "--data", str(tmp_path / "still.h5"))) == 2
+    assert "nobody moves in the 6 scenes" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in figures.iterdir()} == before, "nothing is lost"

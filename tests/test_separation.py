@@ -18,7 +18,7 @@ from gnn.separation import COLUMNS, rerun, separation, state_of, with_only
 from swarm_mjcf.errors import SpecError
 from swarmnet.figures_probe import error_grid, separation_figure
 from swarmnet.reproduce.experiment import Cell
-from swarmnet.reproduce.figure_5_1 import FIGURE_5_1, FIXED, MIXED, draw
+from swarmnet.reproduce.figure_5_1 import FIGURE_5_1, FIXED, MIXED, NONE, column, draw
 
 PRESETS = pytest.mark.parametrize("name", ["thesis-ch3", "thesis-ch5", "best"])
 
@@ -182,9 +182,11 @@ def test_the_figure_of_all_networks_shows_the_mean_over_seeds_and_each_ones_shee
     monkeypatch.setattr(
         "swarmnet.reproduce.figure_5_1.error_grid", lambda *a, **k: (seen.append(a[0]), error_grid(*a, **k))[1]
     )
+    values[column(FIXED, "e", 40, NONE)] = None  # ran away
     files = {path.name for path in draw(tmp_path, done)}
     assert files == {f"figure-5.1{which}{ending}" for which in ("", "-best") for ending in (".png", ".pdf")}
-    assert seen == [{"best": dict.fromkeys(COLUMNS, 2.0), "best, fixed": dict.fromkeys(COLUMNS, 7.0)}]
+    fixed = dict.fromkeys(COLUMNS, 7.0) | {"e": math.inf}
+    assert seen == [{"best": dict.fromkeys(COLUMNS, 2.0), "best, fixed": fixed}]
     assert (tmp_path / "figure-5.1-best.png").read_bytes() == MIXED.encode()
 
 

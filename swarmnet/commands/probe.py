@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 
 from envs.config import SimulateConfig
 from envs.experts.config import ExpertConfig
@@ -49,16 +50,15 @@ def run(config: Probe) -> int:
     if not 0 <= config.scene < len(data):
         raise SpecError("scene", config.scene, f"from 0 to {len(data) - 1}")
     found: dict[str, Any] = {"scenes": len(data), "dt": data.dt}
-    for name in PICTURES:
-        (config.run / "figures" / f"{name}.svg").unlink(missing_ok=True)
-    span = SIMULATED if expert is not None else spans_of(samples_of(data))
+    pictures: dict[str, Figure | None] = dict.fromkeys(PICTURES)
+    span = SIMULATED if expert is not None else _spans(data)
     fields = [_known(model, kind, expert, over, span) for kind in kinds for over in ("position", "velocity")]
     found["force_fields"] = [
         {"kind": f.kind, "over": f.over, "r2": _finite(f.r2), "relative_error": _finite(f.relative_error)}
         for f in fields
     ]
     for over in ("position", "velocity"):
-        _write(config.run, f"probe-{over}", force_field_figure([field for field in fields if field.over == over]))
+        pictures[f"probe-{over}"] = force_field_figure([field for field in fields if field.over == over])
     for one in found["force_fields"]:
         if one["r2"] is not None:
             print(f"{one['kind']} over relative {one['over']}: R2 {one['r2']:.3f}, error {one['relative_error']:.1%}")
@@ -73,7 +73,7 @@ def run(config: Probe) -> int:
             print(f"messages between agents -> true pair force: R2 {probe.r2:.3f} (shuffled {probe.shuffled:.3f})")
         except LawError as error:
             print(f"no linear probe: {error}")
-    _draw_contributions(config, model, data)
+    pictures["probe-contributions"] = _contributions(config, model, data)
     if expert is not None:
         try:
             columns = separation(model, data, expert, walls_stay=config.walls_stay)
@@ -85,9 +85,15 @@ def run(config: Probe) -> int:
                 error = dict(zip(column.error.horizons, column.error.published_mean, strict=True))
                 said = ", ".join(f"{error[h]:.3g} at {h}" for h in HORIZONS if h in error)
                 print(f"figure 5.1 ({name}) {' + '.join(column.kinds)}: normalized error {said} steps")
-            _write(config.run, "figure-5.1", separation_figure(columns, tuple(range(min(2, len(data))))))
+            pictures["figure-5.1"] = separation_figure(columns, tuple(range(min(2, len(data)))))
         except LawError as error:
             print(f"no figure 5.1: {error}")
+    for name, picture in pictures.items():
+        path = config.run / "figures" / f"{name}.svg"
+        if picture is None:
+            path.unlink(missing_ok=True)
+        else:
+            write_whole(path, svg(picture))
     write_whole(config.run / "probe.json", json.dumps(found, indent=1) + "\n")
     print(f"{config.run}: probe.json, figures/probe-*.svg")
     return 0
@@ -117,13 +123,20 @@ def _data(config: Probe, model: Model) -> tuple[Trajectories, ExpertConfig | Non
     return data, None if settings is None else from_plain(SimulateConfig, settings).world().expert
 
 
+def _spans(data: Trajectories) -> Spans:
+    samples = samples_of(data)
+    if not np.any(samples["speed"] > 0):
+        raise SwarmError(f"nobody moves in the {len(data)} scenes: no law of motion is seen in them")
+    return spans_of(samples)
+
+
 def _recording(model: Model) -> Path | None:
     """The imported file that a model learned from, where it says so and the file is still there."""
     named = [Path(about["learn"]["data"]) for about in model.trained_on if "learn" in about and "simulate" not in about]
     return next((path for path in named if path.exists()), None)
 
 
-def _draw_contributions(config: Probe, model: Model, data: Trajectories) -> None:
+def _contributions(config: Probe, model: Model, data: Trajectories) -> Figure | None:
     """Of the first agents that are in the scene at any time, with gaps where they are not."""
     scene, window = config.scene, model.config.window
     mask = data.mask[scene][:, data.kind[scene] == AGENT]
@@ -131,12 +144,11 @@ def _draw_contributions(config: Probe, model: Model, data: Trajectories) -> None
     agents = tuple(int(agent) for agent in np.flatnonzero(there.any(axis=0)))
     if not agents:
         print(f"no contributions: no agent of scene {scene} is there for as many rows as the model sees, {window}")
-        return
+        return None
     parts = {kind: np.where(there[..., None], part, np.nan) for kind, part in along(model, data, scene).items()}
-    shown = contribution_figure(parts, dt=data.dt, agents=agents[:DRAWN], first_row=window - 1)
-    _write(config.run, "probe-contributions", shown)
     if len(agents) > DRAWN:
         print(f"contributions: drawn for the first {DRAWN} of the {len(agents)} agents of scene {scene}")
+    return contribution_figure(parts, dt=data.dt, agents=agents[:DRAWN], first_row=window - 1)
 
 
 def _known(model: Model, kind: str, expert: ExpertConfig | None, over: str, span: Spans) -> ForceField:
@@ -157,7 +169,3 @@ def _known(model: Model, kind: str, expert: ExpertConfig | None, over: str, span
 
 def _finite(value: float) -> float | None:
     return None if value != value else value
-
-
-def _write(run: Path, name: str, figure: Any) -> None:
-    write_whole(run / "figures" / f"{name}.svg", svg(figure))

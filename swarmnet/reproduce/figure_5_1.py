@@ -79,7 +79,8 @@ def draw(folder: Path, done: Sequence[tuple[Cell, dict]]) -> list[Path]:
             for record in (record for cell, record in done if (cell.row, cell.data) == (row, data)):
                 line = found.setdefault(model + (", fixed" if data == FIXED else ""), {name: [] for name in COLUMNS})
                 for name, values in line.items():
-                    values.append(record["values"][column(data, name, HORIZONS[-1], NONE)])
+                    value = record["values"][column(data, name, HORIZONS[-1], NONE)]
+                    values.append(np.inf if value is None else value)  # a prediction that ran away is stored as null
     errors = {line: {name: float(np.mean(values)) for name, values in row.items()} for line, row in found.items()}
     titles = {name: f"({name})\n" + "\n".join(kinds) for name, kinds in COLUMNS.items()}
     label = f"normalized error at {HORIZONS[-1]} steps, truth without walls, mean over seeds"

@@ -398,13 +398,13 @@ FIGURE_5_4 = Borrowing(
     name="figure-5.4",
     about="how far the policies of modes 0, 1, 2 go from the imitation policy, in all unseen scenes and in one",
     rows=tuple(row for row in ROWS if row != SCRATCH),
-    data_sets=(_columns(FEW, *interval(TOUCHING), AWAY, AWAY_SHOWN),),
+    data_sets=(_columns(LONGER, *interval(TOUCHING), AWAY, AWAY_SHOWN),),
     run=run_5_4,
-    size=lambda cell, effort: IMITATION[FEW][0],
+    size=lambda cell, effort: IMITATION[LONGER][0],
     leading=(IMITATED,),
     untrained=(EXPERT,),
     unit="as named",
-    notes=f"Policies of figure 5.2, column `{FEW}`. MSE: mean squared distance of the same agents from the same "
+    notes=f"Policies of figure 5.2, column `{LONGER}`. MSE: mean squared distance of the same agents from the same "
     f"start. {_JUDGED}",
     figure=draw_5_4,
 )
