@@ -153,8 +153,13 @@ def describe(config: AnyModelConfig, scales: Scales, integrator: Integrator) -> 
 
 def check_same(folder: Path, had: dict, about: dict, **kinds: type) -> None:
     """Raises CheckpointError where a run that is gone on with was of other settings. A setting that did not exist when
-    `had` was stored counts as its default, where `kinds` names the type of an entry."""
-    had = had | {name: completed(kind, had[name]) for name, kind in kinds.items() if name in had}
+    `had` was stored counts as its default where `kinds` names the type of an entry, also of the initial model."""
+
+    def now(had: dict) -> dict:
+        known = {name: completed(kind, had[name]) for name, kind in kinds.items() if name in had}
+        return had | known | ({"initial": now(had["initial"])} if had.get("initial") else {})
+
+    had, about = now(had), now(about)
     different = [key for key in about if had.get(key) != about[key]]
     if different:
         raise CheckpointError(

@@ -85,7 +85,7 @@ PEOPLE_AROUND = 5.0
 
 
 def spans_of(samples: Mapping[str, Float[np.ndarray, " n"]]) -> Spans:
-    """Of recordings in which somebody moves, by what is seen in them (`gnn.ranges`): speeds of those who move, spacing."""
+    """Of recordings in which somebody moves (`gnn.ranges`): median and greatest speed of those who do, and spacing."""
     moving = samples["speed"][samples["speed"] > 0]
     speed, fast = (float(np.quantile(moving, share)) for share in (0.5, 0.99))
     spacing = samples["spacing"][samples["spacing"] > 0]

@@ -19,6 +19,7 @@ from jax.sharding import Mesh, PartitionSpec
 from envs.plain import plain
 from envs.record import Array
 from gnn.checkpoint import CheckpointError, Checkpoints, Model, check_same, describe
+from gnn.config import TrainConfig
 from gnn.freeze import frozen
 from gnn.metrics import Metrics, read_metrics
 from gnn.train import Progress, fingerprint
@@ -126,7 +127,8 @@ def train(
     if found is not None:
         step, had, _ = found
         try:
-            check_same(folder, had, about, model=type(model.config), rl=PPOConfig, reward=type(task.reward))
+            kinds = {"model": type(model.config), "train": TrainConfig, "rl": PPOConfig, "reward": type(task.reward)}
+            check_same(folder, had, about, **kinds)
         except CheckpointError:
             checkpoints.close()
             raise

@@ -44,6 +44,9 @@ def test_a_run_goes_on_after_a_setting_has_come_into_being():
     old = {name: value for name, value in about["model"].items() if name != "edge_bias"}
     check_same(Path("r"), about | {"model": old, "step": 3}, about, model=ModelConfig)
     check_same(Path("r"), about | {"step": 3}, about)
+    twice = [about | {"initial": about | {"initial": {"model": model}}} for model in (old, about["model"])]
+    check_same(Path("r"), *twice, model=ModelConfig)
+    check_same(Path("r"), *reversed(twice), model=ModelConfig)
     unbiased = about | {"model": old | {"edge_bias": False}}
     for had, now, kinds in (
         (about | {"model": old}, about, {}),

@@ -133,12 +133,12 @@ def test_a_network_that_is_the_law_has_no_error_in_any_column_and_one_with_mixed
     scenes = flock(6, 44, agents=3)
     exact = separation(by_hand(), scenes, LAW)
     assert list(exact) == list(COLUMNS)
-    for column in exact.values():
-        assert column.error.horizons == (5, 40)
-        assert max(column.error.published_mean) < 1e-6
-        agents = column.truth.kind[0] == AGENT
-        truth = np.concatenate([column.truth.position, column.truth.velocity], axis=-1)[:2]
-        guess = np.concatenate([column.predicted.position, column.predicted.velocity], axis=-1)
+    for one in exact.values():
+        assert one.error.horizons == (5, 40)
+        assert max(one.error.published_mean) < 1e-6
+        agents = one.truth.kind[0] == AGENT
+        truth = np.concatenate([one.truth.position, one.truth.velocity], axis=-1)[:2]
+        guess = np.concatenate([one.predicted.position, one.predicted.velocity], axis=-1)
         np.testing.assert_allclose(guess[:, :, agents], truth[:, :, agents], rtol=1e-3, atol=1e-2)
     # The drag of the goal term sits in the node function: right as long as the goal is there.
     names = {name: COLUMNS[name] for name in "ce"}
