@@ -154,6 +154,7 @@ def _histograms(
             ax.hist(places[:, number, dimension], histtype="step", linewidth=1.3, **style)
             ax.axvline(truth[number, dimension], color=agent_color(number), linestyle=(0, (3, 1.5)), linewidth=1.2)
         ax.set(xlabel=f"{name} [m]", ylabel="share")
+        ax.locator_params(axis="x", nbins=6)
         ax.grid(axis="x", visible=False)
     axes[0].set_title(f"{step} steps ahead ({step * dt:g} s)")
 
