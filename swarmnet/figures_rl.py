@@ -159,7 +159,9 @@ def return_history(
         ax.spines[["top", "right"]].set_visible(False)
     lines, _ = over_steps.get_legend_handles_labels()
     if lines:
-        figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False, handlelength=1.8)
+        figure.legend(
+            handles=lines, loc="outside lower center", ncols=min(len(lines), 4), frameon=False, handlelength=1.8
+        )
     _small_print(figure, note)
     return figure
 
